@@ -31,7 +31,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/checkpoint": (936, 7_099, 5),
     "hma_model/cli": (1_768, 11_268, 12),
     "hma_model/demo": (477, 4_030, 4),
-    "hma_model/evaluation": (4_418, 34_884, 24),
+    "hma_model/evaluation": (4_422, 34_952, 24),
     "hma_model/export": (1_172, 9_349, 9),
     "hma_model/generation": (1_643, 13_265, 9),
     "hma_model/hub": (1_061, 8_204, 6),
@@ -44,7 +44,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_690, 30_256, 20),
     "hma_model/worlds": (1_524, 11_736, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_631, 520_612
+PRODUCT_LINES, PRODUCT_NODES = 65_635, 520_680
 TEST_LINES = 49_266
 DOC_WORDS = 41_990
 

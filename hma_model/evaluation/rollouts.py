@@ -51,6 +51,7 @@ def rollout(
     model: HMA,
     tokenizer: Tokenizer,
     batch: Batch,
+    frames: int | None = None,
     *,
     prompt: int | None = None,
     seed: int = 0,
@@ -63,30 +64,33 @@ def rollout(
         model: in eval mode.
         tokenizer: the tokenizer that the model was trained on.
         batch: windows of T frames; their tokens are the truth, and their unknown chunks are masked.
+        frames: how many to predict; by default all after the prompt.
         prompt: P true frames to start from; by default a third of the window, at least one.
         seed: of every random draw.
         truth: the decoded frames of another rollout of the same windows, which are then not decoded again.
         sampling: options of `HMA.generate`.
 
     Raises:
-        UsageError: the prompt is empty, or leaves no frame of the windows to predict.
+        UsageError: the prompt and the frames do not fit the windows, or one of them is empty.
     """
     length = batch.actions.shape[1]
     first = default_prompt(length) if prompt is None else prompt
-    if not 0 < first < length:
-        raise UsageError("rollout", f"a prompt of {first} frames does not fit windows of {length}")
-    given, chunks = batch.stored[:, :first].to(model.device), batch.actions.to(model.device)
+    count = length - first if frames is None else frames
+    if first < 1 or count < 1 or first + count > length:
+        raise UsageError("rollout", f"{first} + {count} frames do not fit windows of {length}")
+    seen = slice(first + count)
+    given, chunks = batch.stored[:, :first].to(model.device), batch.actions[:, seen].to(model.device)
     generator = torch.Generator().manual_seed(seed)
-    known = batch.action_mask.to(model.device) & model.config.sees_actions
+    known = batch.action_mask[:, seen].to(model.device) & model.config.sees_actions
     passive = model.config.absent_action != "embedding" and not known.any()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", OutsideRangeWarning)  # nobody chose these actions
         predicted = model.generate(
-            given, None if passive else chunks, batch.embodiment, length - first, generator=generator,
+            given, None if passive else chunks, batch.embodiment, count, generator=generator,
             known=None if passive else known, **sampling,
         ).cpu()  # fmt: skip
     if truth is None:
-        truth = decode(tokenizer, batch.stored)
+        truth = decode(tokenizer, batch.stored[:, seen])
     finite = finite_frames(predicted)
     made = decode(tokenizer, predicted)
     made[~finite] = 0  # black, so that a page shows that there is no prediction

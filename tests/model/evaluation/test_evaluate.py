@@ -242,8 +242,8 @@ def test_each_picture_is_decoded_once(data, model):
 
 
 def test_a_rollout_longer_than_the_window_is_refused(model, batch):
-    with pytest.raises(UsageError, match=r"a prompt of 4 frames does not fit windows of 4"):
-        rollout(model, Blocks(), batch, prompt=4)
+    with pytest.raises(UsageError, match=r"2 \+ 3 frames do not fit windows of 4"):
+        rollout(model, Blocks(), batch, frames=3, prompt=2)
 
 
 def test_shuffled_actions_are_another_windows_of_the_same_embodiment(batch):
