@@ -103,14 +103,10 @@ def test_only_a_training_command_with_a_process_of_its_own_keeps_freed_memory(mo
 def test_the_whole_data_road_on_a_toy_recording(toy_yaml: Path, tmp_path: Path) -> None:
     out = tmp_path / "shards"
     source = str(tmp_path / "toy.hdf5")
-    made = hma(
-        "convert", "-e", toy_yaml, "--source", source, "--tokenizer", "fsq-8", "--out", str(out), "--json"
-    )
+    made = hma("convert", "-e", toy_yaml, "--source", source, "--tokenizer", "fsq-8", "--out", out, "--json")
     assert made.returncode == 0, made.stderr
     assert json.loads(made.stdout)["episodes"] == 3
-    again = hma(
-        "convert", "-e", toy_yaml, "--source", source, "--tokenizer", "fsq-8", "--out", str(out), "--json"
-    )
+    again = hma("convert", "-e", toy_yaml, "--source", source, "--tokenizer", "fsq-8", "--out", out, "--json")
     assert json.loads(again.stdout)["shards_made"] == 0
     assert hma("shards", "verify", str(out)).returncode == 0
     assert json.loads(hma("shards", "info", str(out), "--json").stdout)["totals"]["frames"] == 45
@@ -123,10 +119,7 @@ def test_the_whole_data_road_on_a_toy_recording(toy_yaml: Path, tmp_path: Path) 
 
 def test_infer_writes_a_yaml_whose_questions_validate_lists(toy_yaml: Path, tmp_path: Path) -> None:
     out = tmp_path / "mine.yaml"
-    assert (
-        hma("registry", "infer", str(tmp_path / "toy.hdf5"), "--id", "mine", "--out", str(out)).returncode
-        == 0
-    )
+    assert hma("registry", "infer", tmp_path / "toy.hdf5", "--id", "mine", "--out", out).returncode == 0
     asked = hma("registry", "validate", str(out))
     assert asked.returncode == 1
     assert "frequency_hz: still TODO" in asked.stdout
@@ -139,9 +132,7 @@ def test_infer_writes_a_yaml_whose_questions_validate_lists(toy_yaml: Path, tmp_
     assert hma("registry", "validate", str(out)).returncode == 0, out.read_text()
     words = ("--out", tmp_path / "o", "--tokenizer", "fsq-8", "--workers", "0")
     assert hma("convert", "-e", out, *words).returncode == 0
-    fails(
-        hma("registry", "infer", str(tmp_path / "toy.hdf5"), "--id", "mine", "--out", str(out)), 1, "exists"
-    )
+    fails(hma("registry", "infer", tmp_path / "toy.hdf5", "--id", "mine", "--out", out), 1, "exists")
 
 
 def test_wrong_usage_is_exit_code_two() -> None:
@@ -156,9 +147,7 @@ def test_an_unknown_embodiment_names_near_ones() -> None:
 
 def test_a_wrong_yaml_lists_every_problem(toy_yaml: Path, tmp_path: Path) -> None:
     toy_yaml.write_text(ARM_YAML.replace("frequency_hz: 10", "frequency_hz: -3").replace("kind:", "kinds:"))
-    done = hma(
-        "convert", "-e", toy_yaml, "--source", str(tmp_path / "toy.hdf5"), "--out", str(tmp_path / "o")
-    )
+    done = hma("convert", "-e", toy_yaml, "--source", tmp_path / "toy.hdf5", "--out", tmp_path / "o")
     fails(done, 1, str(toy_yaml), "frequency_hz", "-3", "kinds: unknown key, did you mean 'kind'")
     assert not (tmp_path / "o").exists()
 

@@ -97,9 +97,7 @@ def ros_message(store: Any, item: Item) -> Any:
     header = header_type(stamp=stamp, frame_id="robot", **more)
     if item.topic == STATE:
         none = np.zeros(0)
-        return types[ROS_TYPES[STATE]](
-            header, name=list(JOINTS), position=item.value, velocity=none, effort=none
-        )
+        return types[ROS_TYPES[STATE]](header, list(JOINTS), item.value, velocity=none, effort=none)
     height, width = item.value.shape[:2]
     return types[ROS_TYPES[CAMERA]](header, height, width, "rgb8", 0, width * 3, item.value.reshape(-1))
 

@@ -160,9 +160,7 @@ def trajectory() -> Message:
     return "trajectory_msgs/msg/JointTrajectory", make
 
 
-def bag(
-    path: Path, topics: dict[str, tuple[Message, float]], form: str = "ros2", seconds: float = 1.0
-) -> Path:
+def bag(path: Path, topics: dict[str, tuple[Message, float]], form: str = "ros2", seconds: float = 1) -> Path:
     store = get_typestore(Stores.ROS1_NOETIC if form == "ros1" else Stores.ROS2_HUMBLE)
     writer: Any = Ros1Writer(path) if form == "ros1" else None
     plugin = StoragePlugin.SQLITE3 if form == "sqlite" else StoragePlugin.MCAP

@@ -178,9 +178,7 @@ def lab_robots(*names: str) -> dict[str, Drivable]:
 SMALL_HEAD: dict[str, Any] = {"channels": 3, "diffusion_width": 32, "diffusion_depth": 1}
 
 
-def trained_on(
-    views: Any, shards: ShardSet, folder: Path, objective: str = "forward", frames: int = 12
-) -> Any:
+def trained_on(views: Any, shards: ShardSet, folder: Path, objective: str = "forward", frames=12) -> Any:
     """Return a world of a saved model whose robot was trained on these cameras."""
     spec, count = shards.spec, 1 if isinstance(views, str) else len(views)
     sizes = {"factored": spec.factored} if spec.kind == "discrete" else SMALL_HEAD

@@ -17,9 +17,7 @@ from tests.data.loading.test_pools import SMALL
 def sets(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """100 and 10 episodes of 60 frames: 3,700 and 370 windows of 12 frames, two rows apart."""
     folder = tmp_path_factory.mktemp("mixture")
-    return [
-        str(make_set(folder / str(i), i, SMALL | {"frames": frames})) for i, frames in enumerate((6_000, 600))
-    ]
+    return [str(make_set(folder / str(i), i, SMALL | {"frames": n})) for i, n in enumerate((6_000, 600))]
 
 
 def mixture(*words: str) -> Result:

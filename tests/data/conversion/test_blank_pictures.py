@@ -98,9 +98,7 @@ def test_a_black_camera_is_refused_and_a_frozen_or_repeating_one_is_flagged(
     assert set(summary.flags) == {"still_pictures:top", "repeated_pictures:top"}
 
 
-def converted(
-    folder: Path, episodes: dict[str, np.ndarray], quality: str, tokenizer: BlockTokenizer
-) -> Summary:
+def converted(folder: Path, episodes: dict[str, np.ndarray], quality: str, tokenizer) -> Summary:
     path = write_hdf5(folder / "toy.hdf5", episodes)
     robot = Embodiment.from_yaml(f"{ARM_YAML}\nquality: {quality}")
     return convert(robot, path, tokenizer, folder / "out", **NO_LIMIT)

@@ -85,9 +85,7 @@ def test_command_and_yaml_choose_together(tmp_path, toy_recording) -> None:
         run(wrong, toy_recording, tmp_path / "none")
 
 
-def test_another_choice_is_another_plan_and_extend_adds_what_was_left_out(
-    tmp_path, toy_arm, toy_recording
-) -> None:
+def test_another_choice_is_another_plan_and_extend_adds_the_rest(tmp_path, toy_arm, toy_recording) -> None:
     first = run(toy_arm, toy_recording, tmp_path / "out", exclude=("demo_3", "demo_4"))
     again = run(toy_arm, toy_recording, tmp_path / "out", exclude=("demo_3", "demo_4"))
     assert (first.left_out, again.made_shards) == (2, 0)
@@ -132,9 +130,7 @@ def test_the_command_counts_what_it_leaves_out(tmp_path, arm_yaml) -> None:
     fails(hma(*words, "--dry-run", "--only", "demo_9"), 2, "--only: 'demo_9' matches no episode", "demo_")
 
 
-def test_inspect_and_doctor_take_the_episodes_that_the_yaml_chooses(
-    tmp_path, toy_recording, arm_yaml
-) -> None:
+def test_inspect_and_doctor_take_the_episodes_that_a_yaml_chooses(tmp_path, toy_recording, arm_yaml) -> None:
     arm_yaml.write_text(ARM_YAML.replace("format: hdf5", "format: hdf5, only: [demo_5]"))
     report = json.loads(hma("inspect", toy_recording, "-e", arm_yaml, "--json").stdout)
     assert report["embodiment"]["first episode"].startswith("demo_5:")

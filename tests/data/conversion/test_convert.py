@@ -45,14 +45,6 @@ def test_shards_open_with_plain_pyarrow(toy_set) -> None:
     assert metadata[b"hma.tokenizer"] == b"block"
 
 
-def test_running_again_does_nothing_and_changes_nothing(toy_arm, toy_recording, tmp_path) -> None:
-    run(toy_arm, toy_recording, tmp_path / "out")
-    before = contents(tmp_path / "out")
-    again = run(toy_arm, toy_recording, tmp_path / "out")
-    assert again.made_shards == 0
-    assert contents(tmp_path / "out") == before
-
-
 def test_control_characters_in_a_path_are_escaped(toy_arm, toy_recording, tmp_path, capsys) -> None:
     out = tmp_path / "two\nlines \x1b[1m"
     run(toy_arm, toy_recording, out)
@@ -99,9 +91,7 @@ def test_a_bad_episode_goes_to_quarantine_and_the_rest_goes_on(toy_arm, toy_reco
     assert not run(toy_arm, toy_recording, tmp_path / "out", max_quarantine=0.1).too_many
 
 
-def test_another_embodiment_or_tokenizer_is_refused_and_nothing_touched(
-    toy_arm, toy_recording, tmp_path
-) -> None:
+def test_another_embodiment_or_tokenizer_is_refused_untouched(toy_arm, toy_recording, tmp_path) -> None:
     run(toy_arm, toy_recording, tmp_path / "out")
     before = contents(tmp_path / "out")
     other = toy_arm.model_copy(update={"id": "other_arm"})

@@ -170,9 +170,7 @@ def test_a_worker_ends_when_its_parent_is_killed(tmp_path: Path) -> None:
     script = tmp_path / "parent.py"
     script.write_text(program)
     root = Path(__file__).parents[3]
-    parent = subprocess.Popen(
-        [sys.executable, str(script)], env={**os.environ, "PYTHONPATH": str(root)}, cwd=root
-    )
+    parent = subprocess.Popen([sys.executable, script], env={**os.environ, "PYTHONPATH": str(root)}, cwd=root)
     while not (tmp_path / "bad-0").exists():
         assert parent.poll() is None
         time.sleep(0.05)

@@ -133,9 +133,7 @@ def test_two_equal_jobs_at_once_only_waste_work(toy_file, out, whole, tmp_path) 
 
 
 @pytest.mark.parametrize("out", [S3], indirect=True)
-def test_of_two_jobs_of_different_plans_at_once_one_is_refused(
-    toy_arm, toy_file, out, whole, tmp_path
-) -> None:
+def test_of_two_jobs_of_different_plans_at_once_one_is_refused(toy_arm, toy_file, out, whole, tmp_path):
     run(toy_arm, toy_file, tmp_path / "other", settings=replace(SMALL, seed=3))
     jobs = {seed: start(tmp_path, toy_file, out, workers=0, seed=seed) for seed in (0, 3)}
     said = {seed: process.communicate(timeout=100)[1] for seed, process in jobs.items()}

@@ -89,9 +89,7 @@ def test_rows_of_another_stride_are_refused_and_nothing_is_touched(toy_recording
         with pytest.raises(OutputError, match=said):
             run(robot(1), toy_recording, out, settings, **options)
     with pytest.raises(OutputError, match=said):
-        Conversion(robot(1), str(toy_recording), BlockTokenizer(), out, settings=settings).run_share(
-            Share(0, 2)
-        )
+        Conversion(robot(1), toy_recording, BlockTokenizer(), out, settings=settings).run_share(Share(0, 2))
     (out / LOCK).unlink()  # which shares leave; it locks nothing
     assert contents(out) == before
     kept = run(robot(1, "stride: 2\n"), toy_recording, out, settings)

@@ -3,8 +3,6 @@
 import re
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from hma_data.conversion.plan import (
     Settings,
@@ -28,36 +26,12 @@ def plan(episodes: list[EpisodeRef], arm: Embodiment, settings: Settings | None 
     return make_plan(episodes, arm, BlockTokenizer.spec, settings or Settings(), "toy")
 
 
-@given(st.lists(st.integers(0, 3000), min_size=1, max_size=40), st.integers(1, 5000))
-def test_every_episode_is_in_one_shard_and_one_split(frames: list[int], size: int) -> None:
-    arm = Embodiment.from_yaml(
-        "{id: a, kind: real, frequency_hz: 5, action: {space: mixed, components: [{key: a, dims: 1}]},"
-        " cameras: [{name: c, key: c}], source: {format: hdf5}}"
-    )
-    made = plan(refs(*frames), arm, Settings(shard_frames=size))
-    placed = [index for unit in made.units for index, _ in unit.episodes]
-    assert sorted(placed) == list(range(len(frames)))
-    assert {unit.split for unit in made.units} == (
-        {"train", "val"} if len(frames) > 1 else {made.units[0].split}
-    )
-
-
-def test_a_shard_is_closed_once_it_is_full(toy_arm: Embodiment) -> None:
-    made = plan(refs(60, 60, 60, 60), toy_arm, Settings(val_fraction=0, shard_frames=100))
-    assert [len(unit.episodes) for unit in made.units] == [2, 2]
-
-
 def test_splits_follow_the_episodes_id_not_its_place(toy_arm: Embodiment) -> None:
     episodes = refs(*[10] * 200)
     by_id = dict(zip((e.id for e in episodes), choose_splits(episodes, 0.2, 0), strict=True))
     reverse = episodes[::-1]
     assert dict(zip((e.id for e in reverse), choose_splits(reverse, 0.2, 0), strict=True)) == by_id
     assert 20 <= sum(split == "val" for split in by_id.values()) <= 60
-
-
-def test_the_sources_own_split_wins() -> None:
-    episodes = [EpisodeRef("a", 5, "val"), EpisodeRef("b", 5, "train"), EpisodeRef("c", 5, "train")]
-    assert choose_splits(episodes, 0.9, 0) == ["val", "train", "train"]
 
 
 @pytest.mark.parametrize(("episodes", "held_out"), [(1, 0), (2, 1), (8, 2), (20, 5), (28, 5), (60, 5)])
@@ -94,13 +68,6 @@ def test_no_episodes_or_two_with_one_id_are_refused(toy_arm: Embodiment) -> None
         plan([], toy_arm)
     with pytest.raises(SourceError, match="two episodes"):
         plan([EpisodeRef("x", 1), EpisodeRef("x", 1)], toy_arm)
-
-
-def test_episodes_cut_from_one_recording_share_a_split() -> None:
-    cut = [EpisodeRef(f"bag{i // 5}-{i % 5}", 10, group=f"bag{i // 5}") for i in range(100)]
-    splits = choose_splits(cut, 0.3, seed=0)
-    assert all(len(set(splits[start : start + 5])) == 1 for start in range(0, 100, 5))
-    assert set(splits) == {"train", "val"}
 
 
 @pytest.mark.parametrize(

@@ -189,9 +189,7 @@ def test_a_bag_is_measured_by_its_primary_camera(tmp_path: Path) -> None:
     slow = Embodiment.from_values(values | {"frequency_hz": 20}, "slow")
     settings = Settings(val_fraction=0)
     summary = convert(slow, tmp_path / "run", BlockTokenizer(), tmp_path / "out", settings=settings)
-    assert summary.warning.endswith(
-        "correct frequency_hz, or sync.rate_hz, and convert again with --overwrite"
-    )
+    assert summary.warning.endswith("frequency_hz, or sync.rate_hz, and convert again with --overwrite")
     assert "10 Hz" in summary.warning and "stated 20 Hz" in summary.warning
     sync = values.get("sync", {}) | {"rate_hz": 20}
     resampled = Embodiment.from_values(values | {"frequency_hz": 20, "sync": sync}, "resampled")

@@ -1,5 +1,6 @@
 """`hma convert --lerobot`: one pass over a recording writes the shards and the dataset of two runs."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -76,6 +77,10 @@ def test_each_output_refuses_its_own_episodes(tmp_path: Path) -> None:
     assert contents(tmp_path / "one") == contents(tmp_path / "two")
     refused = [(tmp_path / "one" / out / "quarantine.jsonl").read_text() for out in ("shards", "set")]
     assert [text.count("\n") for text in refused] == [1, 2]
+    said = {line["id"]: line["message"] for line in map(json.loads, refused[1].splitlines())}
+    assert "one colour throughout" in said["demo_1"]
+    assert "30×20 pixels, the dataset's first episode 96×64" in said["demo_2"]
+    assert json.loads((tmp_path / "one/set/meta/info.json").read_text())["total_frames"] == 9
 
 
 @pytest.mark.slow
@@ -117,9 +122,7 @@ def test_what_a_dataset_beside_shards_cannot_have_is_refused_with_what_to_do(tmp
 @pytest.mark.parametrize("out, dataset", [("a", "a/b"), ("a/b", "a"), ("a", "b/../a")])
 def test_one_folder_inside_the_other_is_refused_before_anything_is_written(out, dataset, tmp_path) -> None:
     data, robot = hdf5(tmp_path)
-    with pytest.raises(
-        UsageError, match="--lerobot: is .*one is inside the other — give two separate folders"
-    ):
+    with pytest.raises(UsageError, match="--lerobot: is .*inside the other — give two separate folders"):
         Conversion(robot, str(data), "fsq-8", tmp_path / out, lerobot=tmp_path / dataset)
 
 
@@ -135,8 +138,6 @@ def test_a_link_to_an_empty_folder_takes_the_dataset(tmp_path: Path) -> None:
     data, robot = hdf5(tmp_path)
     (tmp_path / "disk").mkdir()
     (tmp_path / "set").symlink_to(tmp_path / "disk")
-    convert(
-        robot, str(data), to="lerobot", tokenizer="", out=tmp_path / "set", settings=replace(BOTH, limit=1)
-    )
+    convert(robot, data, to="lerobot", tokenizer="", out=tmp_path / "set", settings=replace(BOTH, limit=1))
     assert (tmp_path / "set" / "meta" / "info.json").is_file() and (tmp_path / "set").is_symlink()
     assert not list(tmp_path.glob(".*"))

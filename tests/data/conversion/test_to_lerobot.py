@@ -1,6 +1,5 @@
 """`hma convert --to lerobot`: lerobot reads the frames and numbers that the shards of a recording hold."""
 
-import json
 import os
 import shutil
 import subprocess
@@ -180,27 +179,6 @@ def test_the_dataset_converts_to_the_shards_of_its_recording(tmp_path: Path) -> 
         assert np.abs(rows["latents"].astype(int) - again["latents"]).mean() < 3
 
 
-# -- stopped, killed, refused
-
-
-@pytest.mark.slow
-def test_an_episode_that_cannot_be_read_is_in_quarantine_and_nothing_of_it_in_the_dataset(tmp_path) -> None:
-    data, robot = hdf5(tmp_path)
-    with h5py.File(data, "a") as file:
-        file["data/demo_1/obs/side"][...] = 7  # one colour throughout
-        del file["data/demo_2/obs/side"]
-        file["data/demo_2/obs/side"] = np.zeros((10, 20, 30, 3), np.uint8)
-    values = robot.to_dict() | {"quality": {"blank": "refuse"}}
-    summary = to_lerobot(Embodiment.from_values(values, "test"), data, tmp_path / "out", max_quarantine=1)
-    lines = (tmp_path / "out" / "quarantine.jsonl").read_text().splitlines()
-    said = {item["id"]: item["message"] for item in map(json.loads, lines)}
-    assert "one colour throughout" in said["demo_1"]
-    assert "30×20 pixels, the dataset's first episode 96×64" in said["demo_2"]
-    assert summary.manifest.quarantined == 2
-    dataset = opened(tmp_path / "out")
-    assert (dataset.meta.total_episodes, len(dataset)) == (1, 9)
-
-
 def test_no_sign_of_life_comes_from_an_episode_that_hangs(tmp_path: Path, monkeypatch) -> None:
     data, robot = hdf5(tmp_path)
     monkeypatch.setattr(reading, "SIGN_EVERY_S", 0.01)
@@ -307,9 +285,6 @@ def test_a_tokenizer_for_frames_that_stay_as_they_are_is_refused(tmp_path, capsy
     assert "leave out --tokenizer and --weights" in capsys.readouterr().err
 
 
-# -- what else comes along
-
-
 @pytest.mark.slow
 def test_episodes_say_how_they_ended(tmp_path: Path) -> None:
     data, robot = hdf5(tmp_path)
@@ -358,9 +333,6 @@ def test_what_may_be_a_motion_in_a_mixed_space_moves_while_it_stays_the_same(tmp
     mixed = Embodiment.from_values(values, "mixed")
     summary = to_lerobot(mixed, data, tmp_path / "out", replace(SMALL, drop_idle=True))
     assert "idle_frames" not in summary.flags
-
-
-# -- lerobot's own tools
 
 
 @pytest.mark.slow

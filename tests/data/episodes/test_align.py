@@ -291,9 +291,6 @@ def test_a_stream_without_samples_is_told() -> None:
         to_clip(episode(STEADY, STEADY[:0], STEADY, STEADY, STEADY), embodiment())
 
 
-# -- times that are equal but for rounding
-
-
 @st.composite
 def ticks(draw: st.DrawFn) -> np.ndarray:
     """Rising whole numbers of 300ths of a second, some twice."""
@@ -345,9 +342,6 @@ def test_a_command_a_few_microseconds_late_is_not_in_force_yet() -> None:
         assert index.tolist() == [0]
 
 
-# -- samples of one stamp
-
-
 def test_of_samples_with_one_stamp_hold_takes_the_last_nearest_the_first() -> None:
     source = np.array([0, 0, 1, 1, 1, 2.0])
     targets = np.array([0, 0.2, 0.9, 1, 1.2, 1.9, 2])
@@ -374,9 +368,6 @@ def test_a_camera_with_one_stamp_for_most_of_its_pictures_is_refused() -> None:
         to_clip(episode(coarse, STEADY, STEADY, STEADY, STEADY), embodiment())
 
 
-# -- streams by name
-
-
 def test_skew_is_told_by_the_key_of_the_component() -> None:
     clip = to_clip(episode(STEADY, STEADY, STEADY, STEADY + 0.01, STEADY), embodiment())
     assert list(clip.skew_ms) == ["front", "wrist", "a", "b", "s"]
@@ -401,9 +392,6 @@ def test_components_of_one_key_share_a_name_and_a_state_of_it_says_so() -> None:
 
 def named(*names: str) -> dict[str, Pictures]:
     return {name: Pictures(STEADY, lambda i: np.zeros((2, 2, 3), np.uint8)) for name in names}
-
-
-# -- numbers that would be moved too far
 
 
 GAP = np.delete(STEADY, np.arange(8, 12))  # nothing from 0.8 to 1.1 s

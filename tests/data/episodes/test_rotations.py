@@ -176,6 +176,4 @@ def test_a_clip_interpolates_each_component_by_its_representation() -> None:
         found = to_clip(run, robot).states
         quarter = 3.1 + (np.pi - 3.1) / 2
         np.testing.assert_allclose(found[:, 1], [3.1, quarter, -quarter, -3.1], atol=1e-6)
-        np.testing.assert_allclose(
-            found[:, [0, 4]], [[3.1] * 2, [1.55] * 2, [-1.55] * 2, [-3.1] * 2], atol=1e-6
-        )
+        np.testing.assert_allclose(found[:, [0, 4]], [[x] * 2 for x in (3.1, 1.55, -1.55, -3.1)], atol=1e-6)

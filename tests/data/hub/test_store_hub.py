@@ -88,9 +88,7 @@ def test_a_set_on_the_hub_is_read_and_verified_by_its_uri(toy_arm, toy_file, hub
         ShardSet("hf://datasets/team/arm/none")
 
 
-def test_verifying_lists_folders_as_often_however_many_shards_they_have(
-    toy_arm, toy_file, hub, monkeypatch
-) -> None:
+def test_verifying_lists_folders_equally_often_for_many_shards(toy_arm, toy_file, hub, monkeypatch) -> None:
     monkeypatch.setattr(blocks, "REQUESTS", 1)  # the client lists for each thread that reads
     monkeypatch.setattr(blocks, "_cache", functools.cache(blocks._cache.__wrapped__))
     found = []
@@ -306,6 +304,4 @@ def test_what_a_hub_cannot_take_is_told(toy_arm, toy_recording, hub) -> None:
     with pytest.raises(OutputError, match="names no dataset of the hub"):
         run(toy_arm, toy_recording, out="hf://team/arm")
     with pytest.raises(OutputError, match="takes whole conversions only"):
-        Conversion(toy_arm, str(toy_recording), BlockTokenizer(), Path(OUT), settings=SMALL).run_share(
-            Share(0, 2)
-        )
+        Conversion(toy_arm, toy_recording, BlockTokenizer(), Path(OUT), settings=SMALL).run_share(Share(0, 2))

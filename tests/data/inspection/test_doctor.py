@@ -161,9 +161,7 @@ def test_an_unreadable_recording_is_one_error(tmp_path: Path) -> None:
     assert (finding.check, finding.severity) == ("readable", "error")
 
 
-def test_a_shard_set_with_changed_bytes_is_an_error(
-    tmp_path, toy_arm, toy_recording, block_tokenizer
-) -> None:
+def test_a_shard_set_with_changed_bytes_is_an_error(tmp_path, toy_arm, toy_recording, block_tokenizer):
     convert(toy_arm, str(toy_recording), block_tokenizer, tmp_path / "shards")
     assert not [finding for finding in examine(str(tmp_path / "shards")) if finding.severity == "error"]
     shard = next((tmp_path / "shards" / "train").iterdir())

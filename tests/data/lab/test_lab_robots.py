@@ -186,9 +186,7 @@ def test_pictures_show_the_links_at_their_recorded_angles(recordings: dict[str, 
     recorded = recordings["planar_arm"]
     for picture, state in zip(recorded.pictures(2), recorded.states(2), strict=True):
         elbow, tip = planar_arm.elbow_and_tip(state[:2])
-        first, second = (
-            (point / 4).astype(int) for point in ((planar_arm.BASE + elbow) / 2, (elbow + tip) / 2)
-        )
+        first, second = ((p / 4).astype(int) for p in ((planar_arm.BASE + elbow) / 2, (elbow + tip) / 2))
         assert picture[first[1], first[0]].tolist() in (upper, fore)  # the forearm may lie on top
         assert picture[second[1], second[0]].tolist() == fore
 

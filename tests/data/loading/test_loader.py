@@ -174,9 +174,7 @@ def test_windows_of_an_episode_longer_than_a_row_group_are_whole(tmp_path: Path)
     for found in (batch, stream):
         assert sorted(found.frame.tolist()) == list(range(71))
         for i, first in enumerate(found.frame.tolist()):
-            np.testing.assert_array_equal(
-                found.tokens[i].reshape(10, -1), rows["tokens"][first : first + 20 : 2]
-            )
+            np.testing.assert_array_equal(found.tokens[i].reshape(10, -1), rows["tokens"][first:][:20:2])
             np.testing.assert_array_equal(found.actions[i].reshape(20, 3), rows["action"][first : first + 20])
 
 

@@ -24,9 +24,7 @@ def out(s3_out: RemotePath) -> RemotePath:
     return s3_out
 
 
-def test_s3_gets_the_bytes_that_a_folder_gets_and_gives_them_back(
-    toy_arm, toy_file, out, whole, toy_set
-) -> None:
+def test_s3_gets_the_bytes_that_a_folder_gets_and_gives_them_back(toy_arm, toy_file, out, whole, toy_set):
     run(toy_arm, toy_file, out)
     assert files(out) == whole
     assert verify(out) == []
@@ -85,9 +83,7 @@ def test_forked_readers_of_a_dataloader_see_the_same_batches(toy_arm, toy_file, 
         assert torch.equal(found.tokens, expected.tokens)
 
 
-def test_busy_answers_and_lost_connections_change_nothing(
-    toy_arm, toy_file, out, whole, proxy, monkeypatch
-) -> None:
+def test_busy_answers_and_lost_connections_change_nothing(toy_arm, toy_file, out, whole, proxy, monkeypatch):
     monkeypatch.setattr(store, "WAITS_S", (0.0,) * 9)
     draws = random.Random(1)
     failed: list[str] = []

@@ -303,29 +303,13 @@ def test_weights_of_another_network_are_refused_by_name(tmp_path, state, named):
     assert "other.safetensors" in str(caught.value) and caught.value.remedy
 
 
-@pytest.mark.parametrize(
-    "bad",
-    [
-        np.zeros((1, 128, 128, 3), np.uint8),
-        np.zeros((1, 256, 256, 3), np.float32),
-        np.zeros((1, 3, 256, 256), np.uint8),
-    ],
-)
-def test_frames_of_another_size_or_dtype_are_refused(tiny, bad):
+def test_frames_and_tokens_that_do_not_fit_are_refused(tiny):
     with pytest.raises(TokenizerError, match="takes uint8 images"):
-        tiny.encode(bad)
-
-
-@pytest.mark.parametrize("bad", [np.int64(-1), np.uint32(2**18), np.uint32(2**32 - 1)])
-def test_ids_outside_the_vocabulary_are_refused(tiny, bad):
+        tiny.encode(np.zeros((1, 128, 128, 3), np.uint8))
     with pytest.raises(TokenizerError, match="262143"):
-        tiny.decode(np.full((1, 16, 16), bad))
-
-
-@pytest.mark.parametrize("bad", [np.zeros((1, 16, 16)), np.zeros((1, 8, 8), np.uint32)])
-def test_tokens_of_another_kind_are_refused(tiny, bad):
+        tiny.decode(np.full((1, 16, 16), 2**18))
     with pytest.raises(TokenizerError, match="decodes"):
-        tiny.decode(bad)
+        tiny.decode(np.zeros((1, 8, 8), np.uint32))
 
 
 @pytest.mark.slow

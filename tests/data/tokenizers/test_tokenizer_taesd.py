@@ -81,16 +81,6 @@ def test_taef2_keeps_its_known_quality_on_a_whole_frame(real_data, taef2):
     assert 10 * torch.log10(4 / (pixels - made).square().mean()) == pytest.approx(37.4, abs=0.7)
 
 
-@pytest.mark.slow
-@pytest.mark.real
-def test_taef2_gives_photographs_of_hands_back(real_data, taef2):
-    import cv2
-
-    paths = sorted((real_data / "hands" / "images").glob("*.jpg"))[:2]
-    true = np.stack([square(cv2.imread(str(path))[..., ::-1]) for path in paths])
-    assert psnr_db(true, taef2.decode(taef2.encode(true))).min() > 26
-
-
 @pytest.mark.parametrize("pooled", [0, 16])
 def test_the_network_is_the_one_written_out(tmp_path, pooled):
     encoder, decoder = tiny_halves(width=8, pooled=pooled)

@@ -126,9 +126,7 @@ def test_a_decoder_that_learns_alone_leaves_the_tokens_as_they_are(tmp_path):
         assert tokenizer.spec == first.spec
         assert np.array_equal(tokenizer.encode(pictures), ids)
         assert not np.array_equal(tokenizer.decode(ids), first.decode(ids))
-    train(
-        write_recipe(tmp_path), tmp_path / "fourth", {"start": str(tmp_path / "second"), **GROWN}, report=str
-    )
+    train(write_recipe(tmp_path), tmp_path / "fourth", {"start": f"{tmp_path}/second", **GROWN}, report=str)
     assert get_tokenizer("fsq-8", weights=tmp_path / "fourth").spec != first.spec
 
 

@@ -42,9 +42,6 @@ def scenes(count: int, size: int) -> np.ndarray:
     return np.stack([draw_scene(rng, size) for _ in range(count)])
 
 
-# -- contract
-
-
 HERE = [name for name, entry in CATALOG.items() if entry.weights in ("embedded", "none")]
 
 
@@ -108,30 +105,8 @@ def test_every_tokenizer_keeps_the_contract(name):
     made = tokenizer.decode(tokens)
     assert made.shape == frames.shape and made.dtype == np.uint8
     assert psnr_db(frames, made).mean() > 20
-
-
-@pytest.mark.parametrize("name", HERE)
-def test_no_frames_give_no_tokens(name):
-    tokenizer = get_tokenizer(name)
-    size = tokenizer.spec.image_size
-    tokens = tokenizer.encode(np.empty((0, size, size, 3), np.uint8))
-    assert len(tokens) == 0
-    assert tokenizer.decode(tokens).shape == (0, size, size, 3)
-
-
-def test_the_embedded_vocabulary_is_two_digits_of_512(fsq16):
-    assert fsq16.spec.vocab_size == 2**18
-    assert fsq16.spec.factored == (512, 512)
-    assert fsq16.spec.grid == (16, 16)
-
-
-def test_raw_gives_the_same_pixels_back():
-    raw = get_tokenizer("raw")
-    frames = scenes(2, 256)
-    assert np.array_equal(raw.decode(raw.encode(frames)), frames)
-
-
-# -- determinism
+    assert tokenizer.encode(frames[:0]).shape == (0, *cells)
+    assert tokenizer.decode(tokens[:0]).shape == (0, *frames.shape[1:])
 
 
 @pytest.fixture
@@ -197,9 +172,6 @@ def test_threads_may_encode_at_the_same_time(fsq8, threads):
     assert np.array_equal(np.concatenate(parts), whole)
 
 
-# -- quantizer
-
-
 @pytest.mark.parametrize("levels", [((8, 8, 8), (8, 8, 8)), ((16, 4), (3,))])
 def test_ids_and_levels_are_one_to_one(levels):
     quantizer = Quantizer(FsqConfig(levels=levels))
@@ -239,9 +211,6 @@ def test_quantisation_passes_the_gradient_of_the_squashing():
     assert latents.grad is not None and torch.allclose(latents.grad, expected, atol=1e-6)
 
 
-# -- bad input
-
-
 @pytest.mark.parametrize(
     "frames",
     [
@@ -256,17 +225,12 @@ def test_frames_of_another_size_or_dtype_are_refused(fsq8, frames):
         fsq8.encode(frames)
 
 
-@pytest.mark.parametrize("bad", [2**18, 2**32 - 1])
+@pytest.mark.parametrize("bad", [2**18, 2**32 - 1, -1])
 def test_ids_outside_the_vocabulary_are_refused(fsq8, bad):
-    tokens = np.zeros((1, 8, 8), np.uint32)
+    tokens = np.zeros((1, 8, 8), np.int64)
     tokens[0, 3, 3] = bad
     with pytest.raises(TokenizerError, match="262143"):
         fsq8.decode(tokens)
-
-
-def test_negative_ids_are_refused(fsq8):
-    with pytest.raises(TokenizerError, match="-1"):
-        fsq8.decode(np.full((1, 8, 8), -1, np.int64))
 
 
 @pytest.mark.parametrize("tokens", [np.zeros((1, 16, 16), np.uint32), np.zeros((1, 8, 8), np.float32)])
@@ -288,9 +252,6 @@ def test_an_unknown_name_is_answered_with_the_known_ones():
 def test_an_unknown_device_is_refused():
     with pytest.raises(TokenizerError, match="abacus"):
         get_tokenizer("fsq-8", device="abacus")
-
-
-# -- weights' file
 
 
 def test_missing_weights_are_named(tmp_path):
@@ -363,9 +324,6 @@ def test_weights_hold_nothing_but_the_network():
     config, _, _ = read_weights(WEIGHTS, FORMAT, FsqConfig)
     expected = {name: tuple(p.shape) for name, p in FsqAutoencoder(config).named_parameters()}
     assert {name: tuple(t.shape) for name, t in load_file(WEIGHTS).items()} == expected
-
-
-# -- measuring
 
 
 def test_ssim_and_psnr_agree_with_scikit_image():

@@ -139,9 +139,7 @@ def test_the_graphs_of_the_page_make_what_the_step_makes(tokens: Path, pixels: P
             for name in ("step", "image", "gpu_image")
         )
         draws = driver.draws(np.random.default_rng(1))
-        actions = np.zeros(
-            next(port.shape for port in step.get_inputs() if port.name == "actions"), np.float32
-        )
+        actions = np.zeros(next(one.shape for one in step.get_inputs() if one.name == "actions"), np.float32)
         inputs = {"actions": actions, **driver.state, **draws}
         shown, *whole = driver.step.run(None, inputs)
         for own, theirs in zip(step.run(None, inputs), whole, strict=True):

@@ -154,9 +154,7 @@ def test_unknown_chunks_are_masked_as_in_training(layout: str) -> None:
     made = model.generate(batch.tokens[:, :3], batch.actions, robots, 1, known=known, **how)
     window = torch.cat([batch.tokens[:, :3], torch.full((2, 1, 4, 4), 24)], dim=1)
     with torch.no_grad():
-        masked, plain = (
-            model.video_logits(window, batch.actions, robots, mask)[:, 3] for mask in (known, None)
-        )
+        masked, plain = (model.video_logits(window, batch.actions, robots, m)[:, 3] for m in (known, None))
     low, high = masked[..., 0, :6].argmax(-1), masked[..., 1, :4].argmax(-1)
     assert torch.equal(made[:, 0], low + 6 * high)
     assert (masked - plain).abs().max() > 1e-3

@@ -29,9 +29,7 @@ def compared_names(source: str) -> list[str]:
             operands = [node.value]
         for operand in operands:
             parts = operand.elts if isinstance(operand, ast.Tuple | ast.List | ast.Set) else [operand]
-            found += [
-                str(part.value) for part in parts if isinstance(part, ast.Constant) and part.value in NAMES
-            ]
+            found += [str(one.value) for one in parts if isinstance(one, ast.Constant) and one.value in NAMES]
     return found
 
 

@@ -218,9 +218,7 @@ def test_a_model_abstains_where_it_expects_a_large_error_of_its_own(judge, monke
     kept = sum(1 + 2 * number / 4 <= 6.5 for number in range(24))  # by the line of the meter
     assert (found.abstention.judged, found.abstention.count) == (3 * kept, 72) and kept == 12
     assert found.abstention.precision.value == found.abstention.recall.value == 1
-    assert "abstention: 36 of 72 episodes end with an expected state error of at most 6.5 px" in str(
-        sentences(found)
-    )
+    assert "36 of 72 episodes end with an expected state error of at most 6.5 px" in str(sentences(found))
     assert found.to_json()["outcomes"]["p0"]["stated_uncertainty"][4] == 1
     none = evaluation(judge, policies, max_error=0.5)
     assert "nothing is judged" in str(sentences(none))

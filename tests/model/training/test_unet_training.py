@@ -66,11 +66,7 @@ def test_a_new_robot_is_tuned_published_and_pulled(base, shards, tmp_path, freez
 @pytest.mark.parametrize(
     ("changes", "fault", "said"),
     [
-        (
-            {"model.trunk": "transformer"},
-            RecipeError,
-            "model.trunk: is 'transformer', the checkpoint .* 'unet'",
-        ),
+        ({"model.trunk": "transformer"}, RecipeError, "trunk: is 'transformer', the checkpoint .* 'unet'"),
         ({"model.levels": "[8, 8]"}, RecipeError, "model.levels"),
     ],
 )

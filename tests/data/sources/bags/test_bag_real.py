@@ -85,9 +85,7 @@ def test_the_conformance_suite_of_mcap_reads_as_its_json_says(real_data: Path) -
         bag = Bag(path)
         found = [(place, record) for place, record in bag.records()]
         assert [(r.log_ns, bytes(r.data)) for _, r in found] == expected, path.name
-        assert [bytes(data) for data in bag.payloads([place for place, _ in found])] == [
-            d for _, d in expected
-        ]
+        assert [*map(bytes, bag.payloads([place for place, _ in found]))] == [data for _, data in expected]
         assert bag.counts().total() == len(expected), path.name
         with path.open("rb") as file:
             messages = NonSeekingReader(file).iter_messages(log_time_order=False)

@@ -10,8 +10,6 @@ import cv2
 import h5py
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError, SourceError
@@ -19,7 +17,7 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import open_source
 from hma_data.sources.detect import detect
 from hma_data.sources.hdf5 import file as hdf5_file
-from hma_data.sources.hdf5.file import OPEN_FILES, rows
+from hma_data.sources.hdf5.file import OPEN_FILES
 from tests.data.fresh import run_fresh
 from tests.data.hdf5_files import H, T, W, embodiment, fill
 from tests.data.hub_cache import as_snapshot
@@ -39,9 +37,6 @@ def demos(tmp_path: Path) -> Path:
     return path
 
 
-# -- layouts
-
-
 def test_values_and_pictures_equal_h5py(demos: Path) -> None:
     episode = open_source("hdf5").read(str(demos), "demo_7", embodiment())
     with h5py.File(demos) as file:
@@ -59,11 +54,6 @@ def test_masks_are_the_splits(demos: Path) -> None:
     refs = open_source("hdf5").index(str(demos), embodiment())
     assert [ref.split for ref in refs] == ["train"] * 10 + ["val"] * 2
     assert [ref.frames for ref in refs] == [T + i for i in range(12)]
-
-
-def test_a_named_mask_chooses_the_episodes(demos: Path) -> None:
-    refs = open_source("hdf5").index(str(demos), embodiment(source__split="few"))
-    assert [(ref.id, ref.split) for ref in refs] == [("demo_0", None), ("demo_1", None)]
     with pytest.raises(SourceError, match=r"no mask 'rest'.*few, train, valid"):
         open_source("hdf5").index(str(demos), embodiment(source__split="rest"))
 
@@ -230,17 +220,6 @@ def test_pictures_of_other_shapes_become_rgb(tmp_path: Path, shape: tuple[int, .
     np.testing.assert_array_equal(shown, expected)
 
 
-# -- reading
-
-
-@given(indices=st.lists(st.integers(0, 49), max_size=12), chunk=st.sampled_from([None, 1, 7, 50]))
-def test_rows_are_those_asked_for(indices: list[int], chunk: int | None) -> None:
-    values = np.arange(100).reshape(50, 2)
-    with h5py.File("rows", "w", driver="core", backing_store=False) as file:
-        stored = file.create_dataset("x", data=values, chunks=chunk and (chunk, 2))
-        np.testing.assert_array_equal(rows(stored, indices), values[indices])
-
-
 def test_only_the_chunks_of_the_frames_asked_for_are_read(demos: Path) -> None:
     with h5py.File(demos, "a") as file:
         stored = file["data/demo_9/obs/agentview_image"]
@@ -316,9 +295,6 @@ def test_the_fingerprint_follows_the_bytes(demos: Path) -> None:
     assert open_source("hdf5").index(str(demos))[0].fingerprint != before[0].fingerprint
 
 
-# -- places
-
-
 def test_a_snapshot_in_the_hubs_cache_is_read_where_it_lies(demos: Path, tmp_path: Path) -> None:
     folder = tmp_path / "plain"
     folder.mkdir()
@@ -348,9 +324,6 @@ def test_an_unknown_episode_is_a_source_error(demos: Path) -> None:
         open_source("hdf5").read(str(demos), "demo_99", embodiment())
 
 
-# -- inspect
-
-
 def test_inspect_lists_keys_rate_and_lengths(demos: Path) -> None:
     found = open_source("hdf5").inspect(str(demos))
     keys = {info.key: info for info in found.keys}
@@ -378,9 +351,6 @@ def test_inspect_tells_what_looks_wrong(demos: Path) -> None:
     assert "demo_0: rewards is not finite at step 3" in said
     assert "demo_1: has no actions" in said
     assert "demo_3: of 12 frames, rewards has 2" in said
-
-
-# -- real recordings
 
 
 @pytest.mark.real

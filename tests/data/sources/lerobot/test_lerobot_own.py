@@ -273,9 +273,7 @@ def test_no_row_takes_a_picture_of_the_next_episode(altered: Path) -> None:
     name = f"videos/{CAM}/from_timestamp"
     pq.write_table(table.set_column(table.column_names.index(name), name, pa.array(starts)), path)
     robot, source = arm(cameras=[{"name": "cam", "key": CAM}], state=None), open_source("lerobot")
-    with pytest.raises(
-        EpisodeError, match=r"would show episode_000001 .* and episode_000002 .* at the same time"
-    ):
+    with pytest.raises(EpisodeError, match=r"would show .* and episode_000002 .* at the same time"):
         source.read(str(altered), "episode_000001", robot)
 
 

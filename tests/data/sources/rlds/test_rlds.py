@@ -506,23 +506,6 @@ def test_the_real_bridge_recording_inspects_without_problems(real_data):
     ]
 
 
-@pytest.mark.real
-@pytest.mark.slow
-def test_the_real_bridge_recording_equals_tensorflow_datasets(real_data):
-    tfds = pytest.importorskip("tensorflow_datasets", reason="needs the dependency group tfds")
-    folder = real_data / "rlds" / "bridge_dataset" / "1.0.0"
-    truth = tfds.builder_from_directory(str(folder)).as_dataset(split="train", shuffle_files=False)
-    robot = find("bridge_data_v2")
-    for index, theirs in enumerate(truth):
-        ours = read(folder, f"train/{index:06d}", robot)
-        steps = [{"action": s["action"].numpy(), **s["observation"]} for s in theirs["steps"]]
-        np.testing.assert_array_equal(ours.actions[0].values, [step["action"] for step in steps])
-        np.testing.assert_array_equal(ours.states[0].values, [step["state"].numpy() for step in steps])
-        pictures = ours.streams["primary"].frames(range(len(steps)))
-        differences = pictures.astype(int) - np.array([step["image_0"].numpy() for step in steps])
-        assert np.abs(differences).mean() < 4  # TensorFlow decodes with the fast inverse DCT by default
-
-
 @pytest.mark.parametrize("name", ["a::b", "[x]*?", "100%20 #1 ü機", "file:x"])
 def test_a_folder_of_any_name_is_read(name, tmp_path):
     toy(tmp_path / name / "toy" / "1.0.0")

@@ -148,9 +148,7 @@ def test_jpeg_equals_the_accurate_inverse_dct_of_libjpeg(toy, written, truth):
 def test_texts_are_equal(written, truth):
     for name, episode in each(truth):
         steps = ours(written, name)
-        assert [bytes(blob) for blob in steps.blobs("words")] == [
-            step["words"].numpy() for step in episode["steps"]
-        ]
+        assert list(map(bytes, steps.blobs("words"))) == [step["words"].numpy() for step in episode["steps"]]
         found = steps.example.blobs("steps/names")
         assert [bytes(blob) for blob in found] == [
             word for step in episode["steps"] for word in step["names"].numpy()
