@@ -17,13 +17,14 @@ from hma_data.conversion.plan import Settings
 from hma_data.conversion.rewrite import merge, split
 from hma_data.errors import OutputError, ShardError, UsageError
 from hma_data.registry.embodiment import Embodiment
-from hma_data.shards.manifest import Manifest, derive
+from hma_data.shards.manifest import Manifest
 from hma_data.shards.memmap import export
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import read_footer, to_arrow, to_numpy
 from hma_data.shards.stats import Stats
 from hma_data.shards.verify import verify
 from tests.conftest import ARM_YAML, BlockTokenizer, contents, toy_shards, write_toy
+from tests.data.shards.test_shards_verify import derive_anew
 
 SMALL = Settings(val_fraction=0.3, shard_frames=40)
 
@@ -249,10 +250,8 @@ def test_masks_go_along(tmp_path: Path) -> None:
 
 def mask_some(folder: Path) -> None:
     """Row 3 of every episode is unknown; footers and manifest follow."""
-    manifest = Manifest.load(folder)
-    names = [shard.path for shard in manifest.shards]
-    for name in names:
-        path = folder / name
+    for shard in Manifest.load(folder).shards:
+        path = folder / shard.path
         said, _ = read_footer(path)
         table = pq.read_table(path)
         unknown = table["frame_index"].to_numpy() == 3
@@ -260,9 +259,8 @@ def mask_some(folder: Path) -> None:
         actions[unknown] = 0
         for column, values in (("action", actions), ("action_known", ~unknown)):
             place = table.schema.get_field_index(column)
-            table = table.set_column(
-                place, table.schema.field(place), to_arrow(table.schema.field(place), values)
-            )
+            field = table.schema.field(place)
+            table = table.set_column(place, field, to_arrow(field, values))
         stats = Stats.empty(3)
         for row in said.episodes:
             own = slice(row.row_start, row.row_start + row.rows)
@@ -270,6 +268,4 @@ def mask_some(folder: Path) -> None:
         with pq.ParquetWriter(path, table.schema) as writer:
             writer.write_table(table, row_group_size=2048)
             writer.add_key_value_metadata(replace(said, stats={"action": stats}).to_metadata())
-    derive(folder, names, manifest.embodiment, manifest.tokenizer, manifest.plan, manifest.source).write(
-        folder
-    )
+    derive_anew(folder)

@@ -6,9 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
-from hma_data.errors import UsageError
 from hma_data.lab import pendulum, planar_arm, record, simulator, truth
-from hma_data.lab.family import TRUNK
 from hma_data.lab.family.look import SIZE
 
 STRIDE = 3
@@ -54,8 +52,3 @@ def test_parts_are_where_their_colours_are() -> None:
     tee = truth.episode("pusht_slow", 40, 5, 1, 2)
     x, y = (tee.parts[:, 2] * tee.pictures.shape[2] / SIZE).round().astype(int).T
     assert (np.abs(tee.pictures[rows, y, x].astype(int) - (246, 160, 76)).max(axis=-1) < 30).mean() > 0.8
-
-
-def test_a_robot_that_has_no_simulator_is_refused() -> None:
-    with pytest.raises(UsageError, match=f"bridge: has no simulator in the toolkit — known: .*{TRUNK[0]}"):
-        simulator.embodiment("bridge")

@@ -214,15 +214,17 @@ def write(path: Path, table: pa.Table, metadata: dict[bytes, bytes]) -> None:
         writer.add_key_value_metadata(metadata)
 
 
+def derive_anew(folder: Path) -> None:
+    old = Manifest.load(folder)
+    names = [shard.path for shard in old.shards]
+    derive(folder, names, old.embodiment, old.tokenizer, old.plan, old.source).write(folder)
+
+
 def rewritten(folder: Path, change) -> list[str]:
     """Problems after a shard's table was changed and everything derived was written anew over it."""
     path = folder / "train" / "shard-00000.parquet"
     write(path, change(pq.read_table(path)), footer(path))
-    manifest = Manifest.load(folder)
-    names = [shard.path for shard in manifest.shards]
-    derive(folder, names, manifest.embodiment, manifest.tokenizer, manifest.plan, manifest.source).write(
-        folder
-    )
+    derive_anew(folder)
     return verify(folder)
 
 
@@ -273,9 +275,7 @@ def test_episodes_of_one_recording_in_both_splits_are_found(sound: Path) -> None
         for row in values["episodes"]:
             row["group"] = "one"
         write(path, pq.read_table(path), metadata | {b"hma": json.dumps(values).encode()})
-    manifest = Manifest.load(sound)
-    names = [shard.path for shard in manifest.shards]
-    derive(sound, names, manifest.embodiment, manifest.tokenizer, manifest.plan, manifest.source).write(sound)
+    derive_anew(sound)
     assert any("both splits" in problem for problem in verify(sound))
 
 

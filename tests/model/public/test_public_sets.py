@@ -1,26 +1,39 @@
-"""Public Push-T sets: small copies of their layouts go from the published files to figures in one call."""
+"""Public Push-T sets, WorldArena's layout and Zarr: from the published files to figures."""
 
 import argparse
+import base64
 import hashlib
 import json
 import shutil
 import sys
 import zipfile
+import zlib
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
+from typing import Any
 
+import av
 import h5py
 import numpy as np
 import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from hma_data.errors import HMAError, SourceError, StorageAwayError
+from hma_data.errors import HMAError, SourceError, StorageAwayError, UsageError
+from hma_data.registry.embodiment import find
 from hma_data.tokenizers.base import get_tokenizer
+from hma_model.config import HMAConfig
+from hma_model.network.model import HMA
+from hma_model.worlds.world import World
 from recipes.public import dino_wm, gpc, iws, sets
 from recipes.public.sets import BASELINE, checked_file, gaussian_ssim
+from recipes.public.worldarena import export
+from recipes.public.zarr2 import ZarrArray, unblosc
 from tests.model.public import look_alikes
+from tests.model.public.look_alikes import write_zarr
+from tests.model.true_world import _of_robot
 
 TINY = [
     "model.levels=[8]", "model.width=16", "model.layers=1", "model.heads=2", "frames=3",
@@ -202,3 +215,185 @@ def test_a_download_with_another_content_is_refused(tmp_path) -> None:
     assert (tmp_path / "got.zip").read_bytes() == b"bytes"
     with pytest.raises(StorageAwayError, match=r"cannot be downloaded.*--from"):
         checked_file((tmp_path / "gone").as_uri(), "00", tmp_path / "got.zip")
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    tokenizer = get_tokenizer("fsq-8")
+    config = HMAConfig(
+        layers=1,
+        width=32,
+        heads=2,
+        frames=3,
+        grid=(8, 8),
+        factored=(8,) * 6,
+        tokenizer=tokenizer.spec.to_json(),
+    )
+    return World(_of_robot(HMA(config), find("iws_pusht"), False), tokenizer)
+
+
+def asked(recording: Path, out: Path, **changes: object) -> argparse.Namespace:
+    facts = {"recording": recording, "embodiment": "iws_pusht", "task": "push_t", "out": out, "name": "ours"}
+    facts |= {"episodes": None, "frames": 4, "context": 2, "size": 64}
+    return argparse.Namespace(**facts | changes)
+
+
+def frames_of(path: Path) -> np.ndarray:
+    with av.open(str(path)) as film:
+        return np.stack([frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)])
+
+
+def test_each_episode_has_its_videos_where_worldarena_looks_for_them(world: World, tmp_path: Path) -> None:
+    recording = look_alikes.iws(tmp_path / "published", episodes=4, frames=6) / "val"
+    assert export(world, asked(recording, tmp_path / "out")) == 4
+    rows = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert len(rows) == 4
+    for row in rows:
+        parts = Path(row["gt_path"]).parts
+        task, episode = parts[-5], parts[-1].split(".")[0]  # as preprocess_datasets_diversity.py finds them
+        assert task == "push_t" and Path(row["image"]).is_file() and row["prompt"][0]
+        true = frames_of(Path(row["gt_path"]))
+        assert true.shape == (4, 64, 64, 3)
+        films = [f"{folder}_sort/{task}_{episode}.mp4" for folder in ("ours", "ours_1", "ours_2", "gt")]
+        made, one, two, flat = (frames_of(tmp_path / "out" / film) for film in films)
+        assert made.shape == one.shape == two.shape == true.shape and np.array_equal(flat, true)
+        assert np.abs(made[:2].astype(int) - one[:2]).mean() < 2  # the given frames, but for the codec
+
+
+def test_the_variants_have_the_actions_of_other_episodes(world: World, tmp_path: Path, monkeypatch) -> None:
+    recording = look_alikes.iws(tmp_path / "published", episodes=3, frames=6) / "val"
+    steps = []
+    step = world.step
+    monkeypatch.setattr(world, "step", lambda chunks: steps.append(chunks) or step(chunks))
+    export(world, asked(recording, tmp_path / "out"))
+    own, first, second = (np.stack(list(steps[2 * number].values())) for number in range(3))
+    assert np.array_equal(first, own[[1, 2, 0]]) and np.array_equal(second, own[[2, 0, 1]])
+
+
+def test_tasks_share_a_folder(world: World, tmp_path: Path) -> None:
+    recording = look_alikes.iws(tmp_path / "published", episodes=3, frames=6) / "val"
+    for task in ("push_t", "other"):
+        export(world, asked(recording, tmp_path / "out", task=task, frames=2, context=1))
+    assert len(json.loads((tmp_path / "out" / "summary.json").read_text())) == 6
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"task": "a/b"}, "--task.*no name of a folder"),
+        ({"name": ".."}, "--name.*no name of a folder"),
+        ({"frames": 7}, "has 0 of the chosen episodes with 7 frames; 3 are needed"),
+        ({"episodes": [0, 1, 99, -1]}, "has 2 of the chosen"),
+        ({"context": 0}, "--context: is 0, of 4 --frames"),
+        ({"context": 4}, "--context: is 4, of 4 --frames"),
+    ],
+)
+def test_what_cannot_be_written_is_refused(changes, said: str, world: World, tmp_path: Path) -> None:
+    recording = look_alikes.iws(tmp_path / "published", episodes=3, frames=6) / "val"
+    with pytest.raises(UsageError, match=said):
+        export(world, asked(recording, tmp_path / "out", **changes))
+
+
+def test_a_damaged_summary_is_named(world: World, tmp_path: Path) -> None:
+    recording = look_alikes.iws(tmp_path / "published", episodes=3, frames=6) / "val"
+    (tmp_path / "summary.json").write_text("[1]")
+    with pytest.raises(UsageError, match="is no list of episodes"):
+        export(world, asked(recording, tmp_path))
+
+
+# (300, 2) float32, compressed by numcodecs 0.15; LZ4 in blocks of 1,024 bytes, which are split in streams
+FRAMES = {
+    "lz4": "AgEhBGAJAABgCQAAewAAABQAAAANAAAAHwABAP//QVAAAAAAAA0AAAAfAAEA//9BUAAAAAAAIwAAAB8AAQBkH4ACAG"
+    "QP7wBkLwBAAgAVH4ACADsPAQBgUICAgICAGgAAAB8AAQBkHz8CAD0PAQAUH0ACAP9QUD9AP0A/",
+    "zstd": "AgGRBGAJAABgCQAARAAAABQAAAAsAAAAKLUv/WBgCBUBAEAAgECAAD9APwqgoPgBYPdj1FS2aDq9pgu65fUpLU3S71c=",
+    "zlib": "AgFgBGAJAABgCQAAgAAAABQAAAASAAAAeNpjYBgFwxs02A8EDQC0owsyGAAAAHjaY2BosGcAg2FB2w9emsFhJNEAVx"
+    "k1YhoAAAB42mNgYHBgYGCwZxgxtMMQoBuGPA0AQ5089hgAAAB42mNgcHBgYGiwZ6A73TBKD2MaAHKKbHY=",
+}
+CLAIMS = (
+    b"\x28\xb5\x2f\xfd\xe0" + (1 << 40).to_bytes(8, "little") + b"\1\0\0"
+)  # Zstandard that claims 2^40 bytes
+REFUSED = {  # the same values; only the header counts
+    "bit shuffle": "AgEkBGAJAABgCQAAngAAAA==",
+    "blosclz": "AgEBBGAJAABgCQAAiQAAAA==",
+}
+
+
+@pytest.mark.parametrize("codec", FRAMES)
+def test_frames_of_the_usual_writer_are_read(codec: str) -> None:
+    row = np.arange(300)
+    expected = np.stack([row // 60, 0.5 * (row // 100)], axis=1).astype("<f4")
+    found = unblosc(base64.b64decode(FRAMES[codec]), expected.nbytes, Path("0.0"))
+    assert np.array_equal(np.frombuffer(found, "<f4").reshape(300, 2), expected)
+
+
+@pytest.mark.parametrize("codec", REFUSED)
+def test_a_codec_that_is_not_read_is_named(codec: str) -> None:
+    frame = base64.b64decode(REFUSED[codec]).ljust(158, b"\0")
+    with pytest.raises(SourceError, match=f"Blosc with {codec}.*convert it with the zarr package"):
+        unblosc(frame, 2400, Path("0.0"))
+
+
+@pytest.mark.parametrize("compressor", [None, "zlib", "blosc"])
+def test_rows_are_put_together_from_chunks(compressor: str | None, tmp_path: Path) -> None:
+    values = np.arange(7 * 5, dtype=np.int32).reshape(7, 5)
+    write_zarr(tmp_path / "a", values, (3, 2), compressor)
+    array = ZarrArray(tmp_path / "a")
+    assert array.shape == (7, 5) and array.dtype == np.int32
+    assert np.array_equal(array.rows(0, 7), values)
+    assert np.array_equal(array.rows(2, 4), values[2:4])
+    (tmp_path / "a" / "1.0").unlink()  # a chunk that was never written holds the fill value
+    found = ZarrArray(tmp_path / "a").rows(3, 6)
+    assert (found[:, :2] == 0).all() and np.array_equal(found[:, 2:], values[3:6, 2:])
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"filters": [{"id": "delta"}]}, "has filters"),
+        ({"order": "F"}, "order F"),
+        ({"dtype": "|O"}, "type object"),
+        ({"chunks": [1 << 20, 1 << 20]}, "has chunks"),
+        ({"compressor": {"id": "lzma"}}, "compressed by lzma"),
+        ({"shape": None}, "no array of Zarr's format 2"),
+        ({"shape": []}, "no array of Zarr's format 2"),
+        ({"shape": [-4, 2]}, "no array of Zarr's format 2"),
+        ({"chunks": ["4", 2]}, "no array of Zarr's format 2"),
+        ({"compressor": "zlib"}, "no array of Zarr's format 2"),
+        ({"fill_value": "words"}, "no array of Zarr's format 2"),
+        ({"dimension_separator": "/../"}, "no array of Zarr's format 2"),
+        ({"shape": [1 << 40, 2]}, "has rows 0 to 1099511627776"),
+        ({"shape": [4, 1 << 40]}, "more than 1,073,741,824 bytes"),
+    ],
+)
+def test_other_forms_are_refused(changes: dict[str, Any], said: str, tmp_path: Path) -> None:
+    write_zarr(tmp_path / "a", np.zeros((4, 2), np.float32), (4, 2))
+    facts = json.loads((tmp_path / "a" / ".zarray").read_text()) | changes
+    (tmp_path / "a" / ".zarray").write_text(json.dumps(facts))
+    with pytest.raises(SourceError, match=said):
+        array = ZarrArray(tmp_path / "a")
+        array.rows(0, len(array))
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"\2\1\x21\4", zlib.compress(b"short"), b"x" * 40, CLAIMS, bytes(1 << 17)]
+)
+@pytest.mark.parametrize("compressor", ["zlib", "blosc", "zstd", None])
+def test_a_damaged_chunk_is_named(content: bytes, compressor: str | None, tmp_path: Path) -> None:
+    write_zarr(tmp_path / "a", np.ones((4, 2), np.float32), (4, 2), compressor)
+    (tmp_path / "a" / "0.0").write_bytes(content)
+    with pytest.raises(SourceError, match=r"0\.0: is damaged"):
+        ZarrArray(tmp_path / "a").rows(0, 4)
+
+
+@pytest.mark.parametrize("frame", ["lz4", "zstd", "zlib"])
+def test_damaged_frames_are_refused_whatever_is_damaged(frame: str, tmp_path: Path) -> None:
+    whole = base64.b64decode(FRAMES[frame])
+    write_zarr(tmp_path / "a", np.ones((300, 2), np.float32), (300, 2), "blosc")
+    rng = np.random.default_rng(0)
+    for place in (*range(40), *rng.integers(40, len(whole), 20)):
+        for value in (0, 255, whole[place] ^ 1):
+            damaged = bytearray(whole)
+            damaged[place] = value
+            (tmp_path / "a" / "0.0").write_bytes(damaged)
+            with suppress(SourceError):
+                ZarrArray(tmp_path / "a").rows(0, 300)

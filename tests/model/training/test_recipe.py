@@ -244,22 +244,6 @@ def test_a_square_that_does_not_fit_the_levels_is_named():
 SHIPPED = sorted(path.stem for path in (shipped("recipes") / "train").glob("*.yaml"))
 
 
-def test_every_kind_of_recipe_is_shipped():
-    sizes = {f"{kind}_{size}" for kind in ("discrete", "continuous") for size in ("tiny", "base", "xl")}
-    others = {
-        "pretrain40",
-        "finetune",
-        "finetune_colors",
-        "finetune_tiny",
-        "unet_colors",
-        "unet_tiny",
-        "world",
-        "world_pusht",
-        "world_unet",
-    }
-    assert set(SHIPPED) == sizes | others
-
-
 @pytest.mark.parametrize(
     ("source", "tokenizer", "name"),
     [

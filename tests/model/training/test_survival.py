@@ -1,16 +1,28 @@
 """What a run survives: kills at any moment, full disks, other hands in its folder. Each fault in one line."""
 
+import dataclasses
 import errno
+import json
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
+import torch
 
-from hma_data.errors import CheckpointError, OutputError, RecipeError, ShardError
+from hma_data.errors import CheckpointError, OutputError, RecipeError, ShardError, TrainingError
+from hma_data.shards.writer import EpisodeRows, ShardWriter
 from hma_model.checkpoint import io as checkpoint
-from hma_model.checkpoint.folder import resolve
+from hma_model.checkpoint.folder import resolve, training_checkpoints
+from hma_model.training.guards import StepMetrics
+from hma_model.training.logging import read_metrics
 from hma_model.training.loop import train
-from tests.model.runs import TINY
+from hma_model.training.parallel import Ranks
+from hma_model.training.recipe import make_recipe
+from tests.model.processes import errors
+from tests.model.runs import TINY, same, train_until
 from tests.model.shards import make_shards
+from tests.model.training.test_parallel import spread
 
 
 @pytest.fixture
@@ -106,3 +118,101 @@ def test_force_goes_on_with_other_shards_and_other_robots(recipe, tmp_path, caps
     assert after["arm"].agrees_with(before) and set(after) == {"arm", "leg"}
     last = train(recipe(steps=5, data=[str(leg)], ema=ema), out=tmp_path / "run", force=True, show=False)
     assert last.step == 5 and set(checkpoint.load(last.checkpoint).embodiments) == {"leg"}
+
+
+EPISODE, ROW = 2, 10
+
+
+def make_hurt(folder: Path) -> Path:
+    with pytest.MonkeyPatch.context() as patch:
+        plain = ShardWriter.add
+
+        def add(self: ShardWriter, rows: EpisodeRows) -> None:
+            if rows.episode_index == EPISODE:
+                actions = rows.actions.copy()
+                actions[ROW, 0] = np.float32(3e38)
+                rows = dataclasses.replace(rows, actions=actions)
+            plain(self, rows)
+
+        patch.setattr(ShardWriter, "add", add)
+        return make_shards(folder, "arm")
+
+
+def recipe(data: Path, **changes):
+    long = {"steps": 16, "checkpoint_every": 1, "eval_every": 0}
+    return make_recipe({**TINY, "data": [str(data)], **long, **changes})
+
+
+def taken(out: Path) -> list[tuple[int, float | None, int]]:
+    lines = [line for line in read_metrics(out) if line["kind"] == "train"]
+    return [(line["step"], line["loss"], line["skipped"]) for line in lines]
+
+
+def test_the_run_stops_with_episode_and_frames_and_goes_on_from_repaired_shards(tmp_path):
+    whole = train(recipe(make_shards(tmp_path / "well", "arm")), out=tmp_path / "whole", show=False)
+    hurt = make_hurt(tmp_path / "hurt")
+    with pytest.raises(TrainingError, match=r"the loss is nan") as caught:
+        train(recipe(hurt), out=tmp_path / "run", show=False)
+    named = caught.value.fault.split("windows: ")[1]
+    place, _, last = named.rpartition(" to ")
+    head, _, first = place.rpartition(" ")
+    assert head == f"arm episode {EPISODE} (e{EPISODE}) frames" and int(first) <= ROW <= int(last) + 1
+    step = int(caught.value.where.removeprefix("step "))
+    before = [step - 1] if step > 1 else []
+    assert [int(p.name[5:]) for p in training_checkpoints(tmp_path / "run")][-1:] == before
+    repaired = recipe(tmp_path / "well")
+    if before:
+        with pytest.raises(RecipeError, match=r"data\.arm: "):
+            train(repaired, out=tmp_path / "run", show=False)
+    again = train(repaired, out=tmp_path / "run", show=False, force=True)
+    assert again.losses == whole.losses and same(whole.checkpoint, again.checkpoint)
+
+
+@pytest.mark.slow
+def test_steps_left_out_are_counted_everywhere_and_go_on_being_counted(tmp_path, capsys):
+    hurt = make_hurt(tmp_path / "hurt")
+    skipping = recipe(hurt, nonfinite="skip", report=True)
+    whole = train(skipping, out=tmp_path / "whole", show=False)
+    bad = [step for step, loss, _ in taken(tmp_path / "whole") if loss is None]
+    assert 1 < whole.skipped == len(bad) == taken(tmp_path / "whole")[-1][2] < 16
+    train_until(skipping, tmp_path / "cut", bad[0] + 1)
+    capsys.readouterr()
+    again = train(skipping, out=tmp_path / "cut")
+    assert taken(tmp_path / "cut") == taken(tmp_path / "whole") and again.skipped == whole.skipped
+    assert same(whole.checkpoint, again.checkpoint)
+    assert f"{whole.skipped} steps skipped" in capsys.readouterr().err
+    report = (tmp_path / "cut/report.html").read_text()
+    assert f">{whole.skipped}<" in report and "steps skipped" in report
+    state = json.loads((again.checkpoint / "training/state.json").read_text())
+    assert state["skipped"] == whole.skipped
+
+
+@pytest.mark.slow
+def test_two_ranks_leave_out_the_steps_that_one_leaves_out(tmp_path):
+    skipping = recipe(make_hurt(tmp_path / "hurt"), nonfinite="skip", batch_size=1, accumulate=4, steps=10)
+    train(skipping, out=tmp_path / "alone", show=False)
+    told = spread(skipping, tmp_path / "run")
+    one, two = taken(tmp_path / "alone"), taken(tmp_path / "run")
+    assert [(s, loss is None, n) for s, loss, n in two] == [(s, loss is None, n) for s, loss, n in one], told
+    assert one[-1][2] > 0
+    assert [v for _, v, _ in two if v] == pytest.approx([v for _, v, _ in one if v], rel=1e-4)
+
+
+@pytest.mark.slow
+def test_two_ranks_stop_with_one_error_that_names_the_window(tmp_path):
+    hurt = recipe(make_hurt(tmp_path / "hurt"), batch_size=1, accumulate=4)
+    said = errors(spread(hurt, tmp_path / "run", codes=(1, 1)))
+    assert len(said) == 1, said
+    assert f"windows: arm episode {EPISODE} (e{EPISODE}) frames" in said[0] and "; arm" not in said[0]
+
+
+def test_losses_of_several_objectives_are_kept_apart():
+    metrics = StepMetrics(["arm", "hand"], torch.device("cpu"), "forward")
+    for name, objective, losses in (
+        ("arm", "forward", [3.0, 5.0]), ("hand", "policy", [0.5, 0.5]), ("arm", "policy", [0.25, 0.25]),
+    ):  # fmt: skip
+        values = torch.tensor(losses)
+        metrics.add([name] * 2, SimpleNamespace(per_sample=values, loss=values.mean(), objective=objective))
+    loss, by_embodiment, by_objective = metrics.whole(Ranks(), 3)
+    assert loss == pytest.approx((4 + 0.5 + 0.25) / 3)
+    assert by_embodiment == {"arm": 4} and by_objective == {"forward": 4, "policy": 0.375}
