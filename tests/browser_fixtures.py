@@ -23,7 +23,6 @@ EMULATED_GPU = (
 
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Callable[[tuple[str, ...]], "Browser"]]:
-    """A function that launches Chromium with flags; the caller closes it."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:

@@ -225,7 +225,6 @@ def convert_toy(
     arm: Embodiment, recording: Path | str, out: Path | str, settings: Settings = SMALL,
     tokenizer: Any = None, **options: Any,
 ) -> Any:  # fmt: skip
-    """Convert a recording, with the block tokenizer if none is given; returns what `convert` returns."""
     return convert(arm, str(recording), tokenizer or BlockTokenizer(), out, settings=settings, **options)
 
 

@@ -62,7 +62,6 @@ class Hub(ThreadingHTTPServer):
         return made
 
     def add_folder(self, name: str, branch: str, folder: Path) -> str:
-        """A dataset's branch with a folder's files; the commit's id."""
         kept = self.repositories.setdefault(f"datasets/{name}", Repository(name))
         return kept.commit_folder(folder, branch).id
 
@@ -404,7 +403,6 @@ class _Handler(BaseHTTPRequestHandler):
 
 @contextmanager
 def serve() -> Iterator[Hub]:
-    """A hub that runs until the block ends."""
     hub = Hub()
     thread = threading.Thread(target=hub.serve_forever, args=(0.02,), daemon=True)
     thread.start()
@@ -417,7 +415,6 @@ def serve() -> Iterator[Hub]:
 
 
 def connect(monkeypatch: Any, hub: Hub, cache: Any, token: str | None) -> None:
-    """Let the client in this process speak to a hub, with an empty cache; waits become short."""
     from huggingface_hub import constants
 
     monkeypatch.setattr(constants, "ENDPOINT", hub.url)

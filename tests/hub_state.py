@@ -53,8 +53,6 @@ class Habits:
 
 @dataclass
 class Commit:
-    """A state of a repository: path -> content."""
-
     id: str
     files: dict[str, bytes]
     message: str
@@ -70,7 +68,6 @@ class Repository:
     refs: dict[str, str] = field(default_factory=dict)
 
     def commit(self, files: dict[str, bytes | None], message: str = "by hand") -> Commit:
-        """Add a commit; None deletes a file."""
         before = self.commits[-1].files if self.commits else {}
         after = {path: content for path, content in {**before, **files}.items() if content is not None}
         name = hashlib.sha1(f"{self.name} {len(self.commits)} {message}".encode()).hexdigest()
@@ -134,8 +131,6 @@ class Fault:
 
 @dataclass
 class Asked:
-    """A request and how many bytes of a file were sent for it."""
-
     method: str
     path: str
     range: str | None
@@ -145,10 +140,8 @@ class Asked:
 
 
 def sha256(content: bytes) -> str:
-    """Of a content, as LFS names it."""
     return hashlib.sha256(content).hexdigest()
 
 
 def oid(content: bytes) -> str:
-    """Of a content, as git names it."""
     return hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()

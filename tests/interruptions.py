@@ -191,7 +191,6 @@ def first_day(data: Path, folder: Path) -> None:
 
 
 def run_recipe(data: Path) -> None:
-    """A recipe whose runs have averages, and a past of their own making."""
     make_shards(data / "arm", "arm")
     values = {**TINY, "data": [str(data / "arm")], "steps": 3, "checkpoint_every": 1, "accumulate": 2}
     values |= {
@@ -219,7 +218,6 @@ def rails(data: Path, *objectives: str) -> None:
 
 
 def film(data: Path) -> None:
-    """Three videos of grey images, and a checkpoint that infers actions."""
     (data / "film").mkdir()
     for number in range(3):
         write_mp4(data / f"film/{number}.mp4", [np.full((128, 128, 3), 60 * number, np.uint8)] * 8, 10)

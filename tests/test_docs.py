@@ -88,7 +88,6 @@ def test_the_generated_pages_are_up_to_date() -> None:
 
 @cache
 def anchors(page: Path) -> set[str]:
-    """Return the anchors of a page's headings, as GitHub and the site make them."""
     found: set[str] = set()
     for title in re.findall(r"^#+ (.+)$", FENCE.sub("", page.read_text()), re.MULTILINE):
         plain = LINK.sub("", title) if title.startswith("[") else re.sub(r"[`*]", "", title)
@@ -126,7 +125,6 @@ def test_the_tests_that_the_guarantees_name_exist() -> None:
 
 
 def commands(page: Path) -> Iterator[list[str]]:
-    """Yield the words after `hma` of each command in the page's blocks of shell."""
     for kind, text in FENCE.findall(page.read_text()):
         if kind not in ("bash", "sh"):
             continue
@@ -145,7 +143,6 @@ def application() -> Any:
 
 
 def check_command(words: list[str]) -> None:
-    """Check for verbs and options that the application has."""
     command = application()
     while words and hasattr(command, "commands") and not words[0].startswith("-"):
         assert words[0] in command.commands, words

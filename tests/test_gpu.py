@@ -236,7 +236,6 @@ def test_a_run_in_another_way_has_nearly_the_same_curve(shards, options, tmp_pat
 
 @pytest.fixture(scope="module")
 def sliders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Shards of one recording, tokenized on a CPU and on the GPU."""
     folder, robot = tmp_path_factory.mktemp("sliders"), family.embodiment("rails_03")
     recording = lab.record("rails_03", folder / "recording", 3, 0)
     for device in ("cpu", GPU):

@@ -28,7 +28,6 @@ Install = Callable[..., Path]
 
 @pytest.fixture
 def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
-    """Install a distribution for this test: its files, and its entry points by group."""
     before = set(sys.modules)
 
     def made(name: str, files: dict[str, str], points: dict[str, dict[str, str]]) -> Path:

@@ -85,7 +85,6 @@ ROS_TYPES = {
 
 
 def ros_message(store: Any, item: Item) -> Any:
-    """The item as a message of that typestore (ROS 1 headers have `seq`)."""
     types = store.types
     if item.topic == COMMAND:
         layout = types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
@@ -230,7 +229,6 @@ ONE, MANY = 1, 3  # and labels
 
 
 def protobuf_types(layout: dict[str, list[tuple[str, int, int]]]) -> tuple[bytes, dict[str, Any]]:
-    """Return a schema of messages with a stamp and these fields (name, type, label), and their types."""
     from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
 
     files = descriptor_pb2.FileDescriptorSet()
@@ -315,7 +313,6 @@ source: {{format: rosbag}}
 
 
 def arm(text: str = YAML, **changes: str) -> Embodiment:
-    """The embodiment of the recording, with pieces of its YAML replaced."""
     for old, new in changes.items():
         text = text.replace(old, new)
     return Embodiment.from_yaml(text)

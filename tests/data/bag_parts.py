@@ -61,7 +61,6 @@ class Run:
 
 
 def make_run(frames: int = 60, pause_after: tuple[int, ...] = (), side: int = 8, **more: Any) -> Run:
-    """Pictures at 10 Hz, with pauses of 3 s; commands at 25 Hz all along, the gripper told once."""
     times = np.arange(frames) / 10
     for i in pause_after:
         times[i:] += 3.0
@@ -109,7 +108,6 @@ def ros1(folder: Path, run: Run, compression: str | None = None, chunk: int = 40
 
 
 def ros1_without_index(folder: Path, run: Run) -> Path:
-    """As a recorder that was killed leaves it."""
     path = ros1(folder, run)
     path.write_bytes(without_index(path.read_bytes()))
     return path

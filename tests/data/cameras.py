@@ -14,7 +14,6 @@ ACTION = "{space: joint_delta, components: [{key: %s, dims: 2, names: [a, b]}]}"
 
 
 def arm(source: str = "hdf5") -> Embodiment:
-    """The robot, as HDF5 or as a LeRobotDataset."""
     keys = {"hdf5": ("actions", "obs/%s"), "lerobot": ("action", "observation.images.%s")}[source]
     cameras = [
         f"  - {{name: {name}, key: {keys[1] % name}, size: [{height}, {width}]}}\n"
@@ -50,7 +49,6 @@ def write_hdf5(path: Path) -> Path:
 
 
 def write_dataset(folder: Path) -> Path:
-    """The same as a LeRobotDataset, with videos."""
     episodes = [
         LeRobotEpisode(
             pictures={f"observation.images.{camera}": pictures(camera, i, length) for camera in SIZES},

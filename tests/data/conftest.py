@@ -39,7 +39,6 @@ def bags(tmp_path_factory: pytest.TempPathFactory, recording: Recording) -> dict
 
 @pytest.fixture(scope="session")
 def toy_set(toy_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The shards that `convert_toy` makes of `toy_file`; not to be changed."""
     out = tmp_path_factory.mktemp("toy") / "set"
     convert_toy(Embodiment.from_yaml(ARM_YAML), toy_file, out)
     return out

@@ -30,8 +30,6 @@ def expected(frames: Iterable[int]) -> np.ndarray:
 def hand_video(
     labels: str, part: str = "center", action: str = "/next", hz: float | None = 10, **layout: str
 ) -> Embodiment:
-    """An embodiment of two hands in 10 Hz videos."""
-
     def vector(suffix: str) -> dict[str, Any]:
         keys = [f"{side}/{part}{suffix}" for side in ("left", "right")]
         return {"components": [{"key": key, "dims": 2} for key in keys]}
@@ -78,7 +76,6 @@ def write_table(path: Path, table: list[dict[str, Any]]) -> Path:
 
 
 def varint(number: int) -> bytes:
-    """Seven bits a byte, low ones first."""
     out = b""
     while number > 0x7F:
         out, number = out + bytes([number & 0x7F | 0x80]), number >> 7
@@ -115,7 +112,6 @@ def epic_messages(length: int, seen: Seen = always, score: float = 0.9) -> list[
 
 
 def ego4d_box(kind: str, x: float, y: float) -> dict[str, Any]:
-    """A box of 10×8 pixels round a centre given as fractions."""
     box = {"x": x * WIDTH - 5, "y": y * HEIGHT - 4, "width": 10, "height": 8}
     return {"object_type": kind, "structured_noun": None, "bbox": box}
 
@@ -144,7 +140,6 @@ def ego4d_action(frames: Iterable[int], text: str, **said: Any) -> dict[str, Any
 
 
 def ego4d(videos: dict[str, list[dict[str, Any]]]) -> str:
-    """fho_main.json: video uid -> narrated actions."""
     items = [
         {
             "video_uid": uid,

@@ -138,7 +138,6 @@ def floats(count: int) -> Message:
 
 
 def switch(low: float, high: float) -> Message:
-    """A value that is low in even periods of 50 ms and high in odd ones."""
     kind, make = floats(1)
 
     def turn(store: Any, ns: int) -> Any:

@@ -16,7 +16,6 @@ LATE_MS = 30  # of the second camera
 
 
 def stamps(camera: int, length: int) -> list[int]:
-    """Times of a camera's frames: 10 Hz, a little uneven."""
     return [BEGIN + 100 * i + i % 3 + LATE_MS * camera for i in range(length)]
 
 

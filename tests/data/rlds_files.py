@@ -109,7 +109,6 @@ def png(picture: np.ndarray) -> bytes:
 
 
 def write(folder: Path, shards: dict, steps: dict, info=True, metadata=None) -> Path:
-    """A TFDS folder from {file name: [features of each record]}."""
     folder.mkdir(parents=True)
     tree = {"steps": sequence(features_dict(steps), "Dataset")}
     tree["episode_metadata"] = features_dict(metadata or {"file_path": TEXT})

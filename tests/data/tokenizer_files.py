@@ -18,14 +18,12 @@ TINY_MAGVIT2 = Magvit2Config(base=32, z=18, mult=(1, 1, 1, 1, 1), res_blocks=1)
 
 
 def drawn_corpus(folder: Path, count: int) -> dict[str, object]:
-    """Write drawn scenes as recipes/tokenizer/draw.py does; return the recipe's entry for them."""
     rng = np.random.default_rng([1, 2])
     write_pictures(folder / "drawn", (draw_scene(rng) for _ in range(count)))
     return {"kind": "drawn", "pictures": count}
 
 
 def write_recipe(folder: Path, network: dict[str, object], pictures: int = 4, **training: object) -> Path:
-    """Write the recipe of a training of six steps on drawn scenes."""
     steps = {"steps": 6, "batch": 4, "crop": 32, "learning_rate": 0.02, "adam_learning_rate": 0.001}
     values = {
         "job": "tokenizer",
@@ -65,7 +63,6 @@ def frames(count: int, seed: int = 0, size: int = 256) -> np.ndarray:
 
 
 def randomized(network: nn.Module, seed: int = 0) -> nn.Module:
-    """The network with random weights that keep values of order one."""
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         for name, parameter in network.named_parameters():
@@ -78,7 +75,6 @@ def randomized(network: nn.Module, seed: int = 0) -> nn.Module:
 
 
 def magvit2_state(config: Magvit2Config = TINY_MAGVIT2, seed: int = 0) -> dict[str, Tensor]:
-    """Weights by their released names."""
     return {name: p.detach() for name, p in randomized(Magvit2(config), seed).named_parameters()}
 
 
@@ -127,7 +123,6 @@ def write_tiny_pair(folder: Path, name: str = "taesd", **sizes: int) -> Path:
 
 
 def write_tiny_whole(path: Path, **sizes: int) -> Path:
-    """One file in diffusers' layout, whose decoder is numbered without the clamp."""
     encoder, decoder = tiny_halves(**sizes)
     whole = {f"encoder.layers.{key}": tensor for key, tensor in encoder.items()}
     for key, tensor in decoder.items():

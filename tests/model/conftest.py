@@ -44,8 +44,6 @@ def data(arm_shards: Path, hand_shards: Path) -> list[str]:
 
 @pytest.fixture
 def recipe(data: list[str]) -> Callable[..., Recipe]:
-    """Make a tiny recipe of the module's `data` with some keys changed."""
-
     def changed(**changes: object) -> Recipe:
         return make_recipe({**TINY, "data": data, **changes})
 
@@ -66,7 +64,6 @@ def finished(data: list[str], tmp_path_factory: pytest.TempPathFactory) -> Train
 
 @pytest.fixture(scope="session")
 def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An untrained checkpoint of two robots, `arm` and `hand`."""
     folder = tmp_path_factory.mktemp("source") / "model"
     save(folder, ROBOTS)
     return folder

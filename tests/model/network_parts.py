@@ -17,7 +17,6 @@ def seeded(value: int = 0) -> torch.Generator:
 
 
 def small_config(**changes: Any) -> HMAConfig:
-    """Two layers, five frames of sixteen tokens or patches."""
     values: dict[str, Any] = {
         "layers": 2, "width": 32, "heads": 4, "frames": 5, "grid": (4, 4), "factored": (6, 4),
         "base_width": 16, "diffusion_width": 32, "diffusion_depth": 2, "diffusion_sample_steps": 4,
@@ -28,7 +27,6 @@ def small_config(**changes: Any) -> HMAConfig:
 
 
 def small_model(seed: int = 0, **changes: Any) -> HMA:
-    """With both embodiments, in evaluation mode; everything that starts at zero is stirred."""
     torch.manual_seed(seed)
     model = HMA(small_config(**changes))
     model.add_embodiment(ARM)

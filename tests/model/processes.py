@@ -41,7 +41,6 @@ ALONE = {  # no library of the server starts a thread
 
 
 def start(work: Callable[[], Any], said: Path) -> BaseProcess:
-    """Start `work`, which can be pickled, in a process whose output and errors go to the file `said`."""
     serve()
     process = multiprocessing.get_context("forkserver").Process(target=_run, args=(work, said))
     process.start()
@@ -49,7 +48,6 @@ def start(work: Callable[[], Any], said: Path) -> BaseProcess:
 
 
 def serve() -> None:
-    """Start the server of this test process, unless it runs."""
     multiprocessing.get_context("forkserver").set_forkserver_preload([*PRELOAD, __name__])
     before = dict(os.environ)
     os.environ.update(ALONE)
@@ -90,7 +88,6 @@ def end(processes: Sequence[BaseProcess], said: Path) -> list[int]:
 
 
 def run(work: Callable[[], Any], said: Path, code: int = 0) -> str:
-    """Run `work` in a process that must end with this exit code; returns what it said."""
     found, text = end([start(work, said)], said), said.read_text()
     assert found == [code], text
     return text
@@ -104,7 +101,6 @@ def run_command(folder: Path, *words: str, env: dict[str, str] | None = None) ->
 
 
 def command(*words: str, out: Path | None = None, env: dict[str, str] | None = None) -> None:
-    """Be the command `hma`, with its output in a file of its own if need be."""
     os.environ.update(env or {})
     if out:
         os.dup2(os.open(out, os.O_CREAT | os.O_WRONLY), 1)

@@ -22,8 +22,6 @@ CONFIG = HMAConfig(
 
 
 class Blocks:
-    """A tokenizer of 16-pixel images whose cells have the grey of their id."""
-
     spec = SPEC
 
     def decode(self, tokens: np.ndarray) -> np.ndarray:
@@ -33,7 +31,6 @@ class Blocks:
 
 
 def yaml(name: str, dims: int = 2, stride: int = 2) -> str:
-    """A registry YAML with an action of so many dims."""
     return f"""
 id: {name}
 robot: an arm
@@ -76,7 +73,6 @@ def save(folder: Path, names: dict[str, int], seed: int = 0, **given: Any) -> HM
 
 
 def edit_card(folder: Path, name: str, **facts: Any) -> None:
-    """Change facts of an embodiment's card.json, as a person does, and write README.md anew."""
     path = folder / "embodiments" / name / "card.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | facts))
     checkpoint.write_readme(folder)

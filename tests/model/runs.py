@@ -20,8 +20,6 @@ TINY = {
 
 
 def kill_at(step: int) -> Callable[[dict[str, Any]], None]:
-    """Return an `on_progress` that stops a run after a step, as a kill does."""
-
     def kill(facts: dict[str, Any]) -> None:
         if facts["step"] == step:
             raise KeyboardInterrupt

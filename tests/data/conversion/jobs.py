@@ -75,13 +75,11 @@ def start(
 
 
 def ends(process: subprocess.Popen[str]) -> None:
-    """Wait for a conversion that must succeed."""
     _, errors = process.communicate(timeout=200)
     assert process.returncode == 0, errors
 
 
 def files(out: Path) -> dict[str, bytes]:
-    """Return the bytes of every file of a folder here or of a store, by path."""
     if isinstance(out, RemotePath):
         return {name: (out / name).read_bytes() for name in out.listing()}
     return contents(out)

@@ -241,7 +241,6 @@ def test_a_storm_of_kills_ends_with_the_same_bytes(cluster, toy_recording, tmp_p
 
 
 def actors_of(pid: int) -> list[int]:
-    """Actors that work, and their processes, on nodes that `pid` started."""
     parents, names = {}, {}
     for entry in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
@@ -319,8 +318,6 @@ class Chatty:
 
 @dataclass(frozen=True)
 class Slow:
-    """The same work, with a pause at every step; for whoever wants to kill it on the way."""
-
     make_work: Callable[[int], Work]
 
     def __call__(self, workers: int) -> Work:

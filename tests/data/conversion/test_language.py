@@ -37,7 +37,6 @@ SAID = {
 
 @pytest.fixture
 def dataset(tmp_path: Path) -> Path:
-    """A dataset of three episodes, two of them annotated by lerobot's own writer."""
     # Only the tests that need it wait for the import, which takes seconds.
     from lerobot.annotations.steerable_pipeline.reader import iter_episodes
     from lerobot.annotations.steerable_pipeline.staging import EpisodeStaging

@@ -217,7 +217,6 @@ def robot(target_hz: float = 5, more: str = "") -> Embodiment:
 
 
 def shards(folder: Path) -> dict[str, tuple[bytes, int]]:
-    """Bytes and time of change of each shard."""
     found = folder.glob("*/shard-*")
     return {str(path): (path.read_bytes(), path.stat().st_mtime_ns) for path in found}
 

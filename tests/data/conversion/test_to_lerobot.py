@@ -80,7 +80,6 @@ def hdf5(folder: Path) -> tuple[Path, Embodiment]:
 
 
 def bag(folder: Path) -> tuple[Path, Embodiment]:
-    """Two bags whose camera ticks unevenly, at other times than the joints and commands."""
     (folder / "bags").mkdir()
     for number in range(2):
         made = bag_files.make_recording(10 + number, seed=number)

@@ -17,7 +17,6 @@ TICK = 1 / 64  # a binary fraction: sums and differences of times are exact, tie
 
 @st.composite
 def times(draw: st.DrawFn, most: int = 20) -> np.ndarray:
-    """Rising times, some twice."""
     steps = draw(st.lists(st.integers(0, 40), min_size=0, max_size=most - 1))
     return np.cumsum([draw(st.integers(0, 60)), *steps]) * TICK
 
@@ -107,7 +106,6 @@ def episode(front: np.ndarray, wrist: np.ndarray, a: np.ndarray, b: np.ndarray, 
 
 
 def assert_is_reference(clip: Clip, grid: np.ndarray, actions: str, states: str, images: str) -> None:
-    """`clip` is what looking up each time of `grid` alone gives."""
     np.testing.assert_allclose(clip.timestamps, grid - grid[0], atol=1e-9)
     pick = {"nearest": one_nearest, "hold": one_held, "interpolate": one_nearest}
     for name, stream in clip.episode.streams.items():
@@ -293,7 +291,6 @@ def test_a_stream_without_samples_is_told() -> None:
 
 @st.composite
 def ticks(draw: st.DrawFn) -> np.ndarray:
-    """Rising whole numbers of 300ths of a second, some twice."""
     steps = draw(st.lists(st.integers(0, 40), min_size=0, max_size=25))
     return np.cumsum([draw(st.integers(0, 60)), *steps])
 

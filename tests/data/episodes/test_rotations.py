@@ -15,7 +15,6 @@ TARGETS = np.sort(np.concatenate([SAMPLES, np.linspace(0.1, 4.9, 23)]))
 
 
 def matrix(quaternion: np.ndarray) -> np.ndarray:
-    """(..., 4) xyzw -> (..., 3, 3)."""
     x, y, z, w = np.moveaxis(quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True), -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -26,13 +25,11 @@ def matrix(quaternion: np.ndarray) -> np.ndarray:
 
 
 def about(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Quaternions (..., 4) xyzw of turns."""
     half = np.asarray(angle)[..., None] / 2
     return np.concatenate([axis * np.sin(half), np.cos(half) * np.ones_like(half)], axis=-1)
 
 
 def angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Radians between rotation matrices."""
     trace = np.trace(np.swapaxes(a, -1, -2) @ b, axis1=-2, axis2=-1)
     return np.arccos(np.clip((trace - 1) / 2, -1, 1))
 

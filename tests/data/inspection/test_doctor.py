@@ -20,7 +20,6 @@ LENGTHS = (40, 45, 50)
 
 
 def sound(file: h5py.File) -> None:
-    """Episodes without a fault: moving pictures in all colours, actions that vary."""
     draw = np.random.default_rng(0)
     for i, length in enumerate(LENGTHS):
         demo = file.create_group(f"data/demo_{i}")
@@ -85,9 +84,7 @@ def test_a_defect_is_found_by_its_check(tmp_path, damage, check, severity) -> No
     ],
 )
 def test_what_the_yaml_states_is_held_against_the_episodes(tmp_path, old, new, check) -> None:
-    assert check in {
-        finding.check for finding in examined(tmp_path, lambda file: None, ARM_YAML.replace(old, new))
-    }
+    assert check in {one.check for one in examined(tmp_path, lambda file: None, ARM_YAML.replace(old, new))}
 
 
 def test_without_a_yaml_black_pictures_are_a_warning_only_where_no_other_camera_is_left(tmp_path) -> None:

@@ -49,7 +49,6 @@ def test_of_a_whole_and_its_parts_one_is_the_action(tmp_path: Path) -> None:
 
 
 def rlds(folder: Path, action: dict[str, Any], observation: dict[str, Any], **more: Any) -> Path:
-    """One episode of T steps from {key: (feature, values)}."""
     found = {f"action/{key}": item for key, item in action.items()}
     found |= {f"observation/{key}": item for key, item in observation.items()} | more
     steps: dict[str, Any] = {
@@ -249,7 +248,6 @@ def test_libero_states_once_and_no_embedding(tmp_path: Path) -> None:
 
 
 def aloha(folder: Path, compressed: bool, **attributes: Any) -> Path:
-    """Two files of one episode each."""
     folder.mkdir()
     for i in range(2):
         with h5py.File(folder / f"episode_{i}.hdf5", "w") as file:

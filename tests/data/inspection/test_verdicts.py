@@ -196,7 +196,6 @@ def test_inspect_exits_as_doctor_does(tmp_path: Path) -> None:
 
 @pytest.fixture
 def mixed(tmp_path: Path) -> Path:
-    """A folder of an HDF5 recording, a damaged bag, and files of no known format."""
     folder = tmp_path / "from the lab"
     (folder / "monday").mkdir(parents=True)
     write_toy(folder / "monday" / "toy.hdf5", [5, 6])

@@ -26,7 +26,6 @@ def reader(path: Path) -> Any:
 
 
 def read(path: Path) -> dict[str, dict[str, list[Any]]]:
-    """entity -> column -> values in the order of the frames; static columns too."""
     found: dict[str, dict[str, list[Any]]] = defaultdict(lambda: defaultdict(list))
     for chunk in reader(path).stream().to_chunks():
         for name, values in chunk.to_record_batch().to_pydict().items():

@@ -43,7 +43,6 @@ SEED = 3
 
 
 def quick(robots: Iterable[str], *few: str) -> list[Any]:
-    """Return the robots as parameters, all but a few of them slow."""
     return [one if one in few else pytest.param(one, marks=pytest.mark.slow) for one in robots]
 
 
@@ -51,7 +50,6 @@ EVERY = quick(ROBOTS, "arm2_12", "mover_52", "crane_01")
 
 
 def still(world: BlockTable) -> np.ndarray[Any, Any]:
-    """Return the command that keeps a world as it is: no velocity, and each target where its axis is."""
     follows = [axis.target for axis in world.body.commands]
     return np.where(follows, world.pose[: len(follows)], 0.0)
 

@@ -54,7 +54,6 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Recorded]:
 
 
 def replayed(robot: str, episode: int, actions: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Pictures before each action, from the episode's start."""
     world: Any = RECORDERS[robot].start(SEED, episode)[0]
     pictures = []
     for action in actions:

@@ -167,7 +167,6 @@ def test_the_plot_names_every_robot(count: int, tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def sets(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
-    """100 and 10 episodes of 60 frames: 3,700 and 370 windows of 12 frames, two rows apart."""
     folder = tmp_path_factory.mktemp("mixture")
     return [str(make_set(folder / str(i), i, SMALL | {"frames": n})) for i, n in enumerate((6_000, 600))]
 

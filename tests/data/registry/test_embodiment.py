@@ -24,11 +24,9 @@ BASE: dict[str, Any] = {
     "cameras": [{"name": "front", "key": "image"}],
     "source": {"format": "rlds"},
 }
-TWO = {"key": "a", "dims": 2}
 
 
 def changed(path: str, value: Any) -> dict[str, Any]:
-    """The base with one value set, at a path of dots."""
     values = copy.deepcopy(BASE)
     *parents, last = path.split(".")
     holder: Any = values

@@ -36,7 +36,6 @@ def put(folder: Path, name: str, id: str | None = None, hz: Any = 10) -> Path:
 
 
 def own(folder: Path) -> dict[str, Any]:
-    """Entries of that folder by file name: facts, or the faults."""
     return {
         entry.path.stem: entry.facts or [problem["fault"] for problem in entry.problems]
         for entry in entries()

@@ -129,7 +129,6 @@ def test_editors_find_the_schema_from_every_yaml() -> None:
 
 
 def feature(kind: str) -> Any:
-    """`float32[7]`, `image[h,w,c]` or `text` as features.json states it."""
     if kind == "text":
         return rlds_files.TEXT
     if kind == "bool":

@@ -47,7 +47,6 @@ def summary(parts: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def quantile(sketch: dict[str, Any], q: float) -> list[float]:
-    """Of one sketch, by its definition."""
     flat = np.frombuffer(zlib.decompress(base64.b64decode(sketch["values"])), "<f4")
     values = flat.reshape(-1, sketch["width"])
     weights = np.concatenate([np.full(m, 2.0**level) for level, m in enumerate(sketch["rows"])])
@@ -60,17 +59,13 @@ def quantile(sketch: dict[str, Any], q: float) -> list[float]:
 
 
 class Reader:
-    """A shard set, read with pyarrow and the page."""
-
     def __init__(self, folder: Path) -> None:
         text = (folder / "manifest.json").read_bytes()
         self.folder, self.manifest = folder, json.loads(text)
         seal = self.manifest["manifest_sha256"]
         assert hashlib.sha256(text.replace(seal.encode(), b"0" * 64, 1)).hexdigest() == seal
         assert self.manifest["schema_version"] == 1
-        listed = {shard["path"]: shard["sha256"] for shard in self.manifest["shards"]} | self.manifest[
-            "files"
-        ]
+        listed = {one["path"]: one["sha256"] for one in self.manifest["shards"]} | self.manifest["files"]
         for name, sha256 in listed.items():
             assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == sha256, name
         plan = {key: value for key, value in self.manifest["plan"].items() if key != "hash"}

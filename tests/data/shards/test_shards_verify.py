@@ -175,7 +175,6 @@ def test_a_manifest_of_another_run_is_found(sound: Path, tmp_path: Path, toy_arm
 
 
 def reseal(folder: Path, change) -> None:
-    """Write the manifest with one fact changed and a seal that holds."""
     values = json.loads((folder / MANIFEST).read_text())
     change(values)
     values["manifest_sha256"] = "0" * 64
@@ -221,7 +220,6 @@ def derive_anew(folder: Path) -> None:
 
 
 def rewritten(folder: Path, change) -> list[str]:
-    """Problems after a shard's table was changed and everything derived was written anew over it."""
     path = folder / "train" / "shard-00000.parquet"
     write(path, change(pq.read_table(path)), footer(path))
     derive_anew(folder)
@@ -229,7 +227,6 @@ def rewritten(folder: Path, change) -> list[str]:
 
 
 def with_values(table: pa.Table, column: str, change) -> pa.Table:
-    """The table with one column's flat values changed by a function of a numpy array."""
     place, kind = table.schema.get_field_index(column), table.schema.field(column).type
     array = table[column].combine_chunks()
     nested = pa.types.is_fixed_size_list(kind)

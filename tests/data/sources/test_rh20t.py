@@ -97,8 +97,6 @@ def test_a_film_with_fewer_frames_than_times_is_counted_and_one_with_more_refuse
 
 
 def table(name: str, change: Callable[[Any], object]) -> Edit:
-    """Return an edit of the first camera's samples in a table of the first scene."""
-
     def edit(path: Path) -> None:
         content = tables(12)[name]
         change(content)

@@ -43,7 +43,6 @@ def bucket() -> RemotePath:
 
 @pytest.fixture
 def both(toy_set: Path, tmp_path: Path, bucket: RemotePath) -> tuple[Path, RemotePath]:
-    """One shard set, here and copied into the store."""
     shutil.copytree(toy_set, tmp_path / "set")
     for path in (tmp_path / "set").rglob("*"):
         if path.is_file():

@@ -89,9 +89,7 @@ def test_checkpoints_of_all_layouts_give_the_same_tensors(tmp_path, nest, zipped
     for name in ("a.pt", "a.safetensors"):
         read = read_tensors(tmp_path / name)
         assert read.keys() == state.keys()
-        assert all(
-            torch.equal(read[key], state[key]) and read[key].dtype == state[key].dtype for key in state
-        )
+        assert all(torch.equal(read[key], one) and read[key].dtype == one.dtype for key, one in state.items())
 
 
 @pytest.mark.parametrize("text", ["", "[1]", "{", '{"scaling_factor": NaN}'])

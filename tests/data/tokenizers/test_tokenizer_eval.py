@@ -184,7 +184,6 @@ class _Distance(torch.nn.Module):
 
 @pytest.fixture
 def lpips(monkeypatch, tmp_path) -> Path:
-    """A package of that name; the folder where its backbone would lie."""
     module = ModuleType("lpips")
     module.__spec__ = ModuleSpec("lpips", None)
     module.LPIPS = _Distance  # type: ignore[attr-defined]

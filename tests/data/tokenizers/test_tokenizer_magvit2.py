@@ -282,15 +282,9 @@ def altered(**changes: Tensor | None) -> dict[str, Tensor]:
         (altered(encoder__conv_out__weight=None), r"lacks encoder\.conv_out\.weight"),
         (altered(encoder__mid__attn_1__q__weight=torch.zeros(2)), r"encoder\.mid\.attn_1\.q\.weight"),
         (altered(quant_conv__weight=torch.zeros(2)), r"quant_conv\.weight"),
-        (
-            altered(decoder__conv_in__weight=torch.zeros(32, 4, 3, 3)),
-            r"size mismatch for decoder\.conv_in\.weight",
-        ),
+        (altered(decoder__conv_in__weight=torch.zeros(32, 4, 3, 3)), r"size mismatch for decoder\.conv_in"),
         (altered(encoder__conv_in__weight=torch.zeros(24, 3, 3, 3)), "divisible"),
-        (
-            altered(encoder__conv_in__weight=torch.zeros(32, 1, 3, 3)),
-            r"size mismatch for encoder\.conv_in\.weight",
-        ),
+        (altered(encoder__conv_in__weight=torch.zeros(32, 1, 3, 3)), r"size mismatch for encoder\.conv_in"),
         (altered(encoder__conv_in__weight=torch.zeros(0, 3, 3, 3)), "does not hold the weights"),
         (altered(encoder__conv_in__weight=torch.zeros(3)), "does not hold the weights"),
         (altered(decoder__conv_in__bias=torch.full((32,), torch.nan)), "not finite"),

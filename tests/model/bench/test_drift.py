@@ -14,8 +14,6 @@ FRAME_NUMBERS = drift.looked_at(FRAMES, False)[1]
 
 
 class Reader:
-    """A probe of pictures whose first pixel is the place of the only part."""
-
     own, loose = np.array([0]), np.array([], int)
     spread, error = np.array([40.0]), np.array([1.0])
 

@@ -42,8 +42,6 @@ TINY = replace(
 
 
 class FrozenWorld(FlawlessWorld):
-    """A model in which nothing ever moves."""
-
     def step(self, actions: Any, *, decoded: bool = True) -> Any:
         return {row: self.rows[row].picture() for row in actions}
 
@@ -67,7 +65,6 @@ def probe() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """The finished benchmarks of a flawless and of a frozen model."""
     made = tmp_path_factory.mktemp("best"), tmp_path_factory.mktemp("frozen")
     for folder, kind in zip(made, (FlawlessWorld, FrozenWorld), strict=True):
         write_report(benchmark(folder.name, folder, TINY, world=world_of(kind)), folder)

@@ -33,7 +33,6 @@ def weights(change: Callable[[torch.Tensor], torch.Tensor]) -> Edit:
 
 
 def fit(folder: Path) -> None:
-    """Let cards, config.json and stems name the files that are there now."""
     trunk = file_sha256(folder / "trunk.safetensors")
     values(trunk_sha256=trunk)(folder / "config.json")
     for home in (folder / "embodiments").iterdir():
@@ -52,7 +51,6 @@ def of_another_trunk(path: Path) -> None:
 
 
 def fitted(edit: Edit) -> Edit:
-    """Change a file of an embodiment, and let its card name it."""
     return lambda path: (edit(path), fit(path.parents[2]))
 
 

@@ -14,7 +14,6 @@ RED, BLUE, PAPER = (200, 30, 40), (40, 60, 200), (225, 225, 215)
 
 
 def scene(places, colors=(RED, BLUE)):
-    """Draw a disc of each colour at places (2, 2)."""
     picture = np.full((SIZE, SIZE, 3), PAPER, np.uint8)
     for (x, y), color in zip(places, colors, strict=False):
         cv2.circle(picture, (round(x), round(y)), 9, color, -1, cv2.LINE_AA)
@@ -22,7 +21,6 @@ def scene(places, colors=(RED, BLUE)):
 
 
 def scenes(count, seed):
-    """Draw scenes of two discs that do not touch; return pictures and places (N, 2, 2)."""
     parts = np.random.default_rng(seed).uniform(12, SIZE - 12, (4 * count, 2, 2))
     parts = parts[np.linalg.norm(parts[:, 0] - parts[:, 1], axis=-1) > 20][:count]
     return np.stack([scene(places) for places in parts]), parts

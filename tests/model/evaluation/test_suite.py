@@ -31,7 +31,6 @@ SETTINGS = EvaluationSettings(windows=3, draws=1)
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two checkpoints, `one` and `other`, and shard sets of two robots."""
     folder = tmp_path_factory.mktemp("made")
     for name, seed in (("one", 0), ("other", 1)):
         save(folder / name, {"arm": 2, "hand": 3}, seed)

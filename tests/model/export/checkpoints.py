@@ -93,7 +93,6 @@ class Driver:
         self.state["frame"] = frame.astype(self.state["frame"].dtype)
 
     def draws(self, generator: np.random.Generator) -> dict[str, NDArray[Any]]:
-        """Return draws for the likeliest tokens in a random order."""
         made = {
             one["name"]: getattr(generator, one["law"])(size=one["shape"]).astype(np.float32)
             for one in self.about["draws"]

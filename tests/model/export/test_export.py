@@ -39,7 +39,6 @@ FRAMES, EXACT = 100, 40
 def closed_loop(
     page: Path, checkpoint: Checkpoint, robot: str, count: int = FRAMES, exact: int = EXACT
 ) -> list[tuple[Any, Any, float]]:
-    """Return the frames that onnxruntime and torch make of the same actions, and the images' PSNR."""
     model = rounded(load(checkpoint, [robot], "cpu").eval())
     tokenizer = reopened(model.config.tokenizer)
     driver = Driver(page, robot)

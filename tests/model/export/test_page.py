@@ -75,7 +75,6 @@ def site(tokens: Path, runtime: Path, tmp_path: Path) -> Path:
 
 
 def with_runtime(export: Path, runtime: Path, folder: Path) -> Path:
-    """Return a folder whose sub-folder `sub/page` is an export with the runtime."""
     page = Path(shutil.copytree(export, folder / "site" / "sub" / "page"))
     manifest = json.loads((page / "manifest.json").read_text())
     manifest["runtime"] = write_page(page, runtime)
@@ -226,7 +225,6 @@ def test_the_simulator_in_the_page_follows_a_person_and_a_replay(page, server, s
 
 
 def simulated(robot: dict[str, Any], chunks: Any) -> BlockTable:
-    """Return the laboratory's simulation of an export's robot, from its first start on."""
     begun = robot["simulator"]["tables"][0]
     table = BlockTable(Body.of(robot["id"]), np.array(begun["pose"]), np.array(begun["blocks"]))
     for action in np.float32(chunks).reshape(-1, len(robot["dimensions"])):

@@ -17,8 +17,6 @@ WIDEST = max(ARM.chunk_dim, HAND.chunk_dim)
 
 
 class Session:
-    """A prompt, chunks and a seed of one robot, all drawn from a number."""
-
     def __init__(self, model: HMA, number: int, name: str, prompt: int) -> None:
         drawn, config = torch.Generator().manual_seed(number), model.config
         self.name, self.seed, self.made, self.at = name, number, [], count()
@@ -37,7 +35,6 @@ class Session:
 
 
 def advance(rollout: Rollout, sessions: dict[int, Session]) -> None:
-    """Step the sessions' rows, in the order given, and note their frames."""
     at = [next(session.at) for session in sessions.values()]
     chunks = torch.cat([s.chunks[i] for s, i in zip(sessions.values(), at)])
     known = torch.cat([s.known[i] for s, i in zip(sessions.values(), at)])

@@ -262,7 +262,6 @@ def stores(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def versions(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Two checkpoints on one trunk: arm and hand, and another arm."""
     home = tmp_path_factory.mktemp("versions")
     save(home / "old", {"arm": 2, "hand": 3})
     model = checkpoint.load(home / "old", [])

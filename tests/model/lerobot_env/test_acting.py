@@ -74,9 +74,7 @@ def test_lerobot_finds_it_and_its_processors_by_its_name(run: Path) -> None:
 
 def test_what_does_not_fit_is_one_line(run: Path, tmp_path: Path) -> None:
     policy = WorldModelPolicy(WorldModelConfig(checkpoint=str(run), device="cpu"))
-    with pytest.raises(
-        UsageError, match=r"needs observation.image; .* observation.images.hand .*--rename_map"
-    ):
+    with pytest.raises(UsageError, match=r"needs observation.image; .*observation.images.hand .*rename_map"):
         policy.select_action(batch(np.zeros((1, 8, 8, 3), np.uint8), "observation.images.hand"))
     with pytest.raises(UsageError, match="not by lerobot"):
         policy.forward({})

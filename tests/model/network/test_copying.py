@@ -39,7 +39,6 @@ def _batch(config):
 
 
 def _near(digits, config, share=0.7):
-    """Return digits of a frame before, many of them the same, and some unknown."""
     other = torch.stack(
         [torch.randint(0, v, (len(digits),), generator=seeded(v + 9)) for v in config.digits], 1
     )

@@ -16,7 +16,6 @@ WIDTHS = (64, 128, 256)
 
 
 def _activations(model: HMA) -> dict[str, Tensor]:
-    """Return what flows at the places where widths might tell."""
     seen: dict[str, Tensor] = {}
     block = model.trunk.blocks[-1]
     places = {

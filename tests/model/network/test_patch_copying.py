@@ -14,7 +14,6 @@ CHANGES = [{}, {"training_pass": "pairs", "masked_input": "previous"}]
 
 
 def _model(share: int | None = None, **changes):
-    """Return a small model that keeps all or nothing, or shares that depend on the features."""
     model = small_model(kind="continuous", copy_previous=True, **changes)
     linear = model.latent_readout.copy.linear
     with torch.no_grad():

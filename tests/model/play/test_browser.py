@@ -84,7 +84,6 @@ def recorded(
 
 @contextmanager
 def serving(stepper: Stepper, port: int = 0) -> Iterator[int]:
-    """Serve in a thread, as `hma play` does; give the port."""
     listener = socket.create_server(("127.0.0.1", port))
     ready, servers = threading.Event(), []
 

@@ -26,7 +26,6 @@ def scenes(count: int = 2) -> Scenes:
 
 
 def saved(folder: Path, actions: int = 2, **inputs: int) -> Any:
-    """Save a small policy of random weights with its processors, as lerobot's training does."""
     from lerobot.configs.types import FeatureType, PolicyFeature
     from lerobot.policies.act.configuration_act import ACTConfig
     from lerobot.policies.act.modeling_act import ACTPolicy

@@ -359,8 +359,6 @@ def test_a_random_action_is_held_for_a_chunk_and_stays_in_range(world: World) ->
 
 
 class Wild:
-    """A policy whose actions no robot was trained on."""
-
     def __call__(self, image: np.ndarray) -> list[float]:
         return [900, 0]
 

@@ -43,7 +43,6 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def latents() -> World:
-    """A world of latents, whose images have half the size of the simulator's."""
     return World(latent_model(ROBOT), BlockLatents())
 
 

@@ -135,7 +135,6 @@ def test_film_that_pauses_is_labelled_in_parts(world: World, real: Path, tmp_pat
 
 
 def film(folder: Path) -> np.ndarray:
-    """Write a video of thirty grey images at 30 Hz, and return their levels."""
     levels = np.linspace(20, 230, 30).astype(np.uint8)
     write_mp4(folder / "long.mp4", [np.full((96, 128, 3), level, np.uint8) for level in levels], 30)
     return levels
@@ -195,7 +194,6 @@ def grey(folder: Path, **levels: int) -> None:
 
 
 def shown(world: World, out: Path) -> dict[str, int]:
-    """Return the level of each labelled episode, to the nearest ten."""
     shards = ShardSet(out)
     reader, found = EpisodeReader(shards, shards.columns()), {}
     for row in shards.episodes.to_pylist():

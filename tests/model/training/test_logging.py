@@ -37,7 +37,6 @@ def painter(monkeypatch):
 
 @pytest.fixture(scope="module")
 def seen(data, tmp_path_factory) -> Path:
-    """The folder of a short run with everything to see."""
     out = tmp_path_factory.mktemp("seen") / "run"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hma_model.evaluation.rollout_video.tokenizer_of", lambda shards: Blocks())

@@ -55,7 +55,6 @@ def network(recipe: Recipe, spec: TokenizerSpec, device: str = "meta") -> HMA:
 
 
 def forward(model: HMA, recipe: Recipe) -> torch.Tensor:
-    """Return the loss of a pass over windows of nothing."""
     windows, frames = recipe.batch_size, recipe.frames
     shape = (windows, frames, *model.config.frame_shape)
     if model.config.kind == "continuous":

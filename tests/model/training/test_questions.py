@@ -97,8 +97,6 @@ def test_the_baseline_learns_and_keeps_the_prompt_out_of_its_frames(tmp_path: Pa
 
 @dataclass
 class Blank:
-    """A tokenizer whose pictures are black."""
-
     spec: TokenizerSpec
 
     def decode(self, latents: np.ndarray) -> np.ndarray:

@@ -63,9 +63,8 @@ def test_extends_takes_what_is_not_given(write):
 
 def test_extends_replaces_objectives_as_a_whole(write):
     write("base", "objectives: {forward: 1.0}\n")
-    assert load_recipe(write("mine", "extends: base\nobjectives: {passive: 1}\n")).objectives == {
-        "passive": 1.0
-    }
+    recipe = load_recipe(write("mine", "extends: base\nobjectives: {passive: 1}\n"))
+    assert recipe.objectives == {"passive": 1.0}
 
 
 def test_extends_finds_the_shipped_recipes(write):

@@ -129,6 +129,5 @@ def test_the_same_tensors_give_the_same_bytes(tmp_path):
         write_tensors(tmp_path / f"{i}.safetensors", tensors, metadata)
         contents.add((tmp_path / f"{i}.safetensors").read_bytes())
     assert len(contents) == 1 and read_metadata(tmp_path / "0.safetensors") == metadata
-    assert all(
-        torch.equal(value, tensors[n]) for n, value in read_tensors(tmp_path / "0.safetensors").items()
-    )
+    read = read_tensors(tmp_path / "0.safetensors")
+    assert all(torch.equal(value, tensors[name]) for name, value in read.items())

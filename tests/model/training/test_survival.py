@@ -30,10 +30,6 @@ def data(arm_shards: Path) -> list[str]:
     return [str(arm_shards)]
 
 
-def train_quietly(recipe, out: Path) -> None:
-    train(recipe, out=out, show=False)
-
-
 @pytest.fixture
 def full(monkeypatch):
     from hma_model.checkpoint import weights as files

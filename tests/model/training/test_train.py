@@ -141,9 +141,8 @@ def poisoned(monkeypatch):
 def test_a_loss_that_is_no_number_can_be_skipped_and_is_counted(recipe, tmp_path, poisoned):
     result = train(recipe(nonfinite="skip"), out=tmp_path / "run", show=False)
     assert (result.step, result.skipped) == (6, 1)
-    assert all(
-        torch.isfinite(value).all() for value in checkpoint.load(result.checkpoint).state_dict().values()
-    )
+    weights = checkpoint.load(result.checkpoint).state_dict()
+    assert all(torch.isfinite(value).all() for value in weights.values())
 
 
 def test_a_budget_of_cpu_seconds_ends_the_run_and_bends_the_rate(recipe, tmp_path, monkeypatch):

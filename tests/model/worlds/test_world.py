@@ -44,7 +44,6 @@ def make(model: HMA, **settings: Any) -> World:
 
 
 def drawn(model: HMA, name: str, count: int, seed: int = 0) -> np.ndarray:
-    """Return chunks (count, K) within a deviation of the mean."""
     space, rng = model.embodiments[name], np.random.default_rng(seed)
     values = rng.uniform(-1, 1, (count, space.stride, space.action_dim)) * space.std + space.mean
     return values.reshape(count, -1).astype(np.float32)

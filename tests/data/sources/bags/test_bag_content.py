@@ -220,7 +220,6 @@ REORDERED = {
 
 @cache
 def messages(name: str) -> list[bytes]:
-    """The packets of a moving picture, as a recorder would put them into messages."""
     codec, encoder, options = {**CODECS, **REORDERED}[name]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / {"h264": "v.h264", "h265": "v.hevc"}.get(codec, "v.mkv")
@@ -244,7 +243,6 @@ def film(path: Path, encoder: str, options: dict[str, str]) -> None:
 
 
 def decoded(packets: list[bytes], codec: str, in_order: bool) -> list[Images | None]:
-    """Each picture, or None where it is refused."""
     keyframes = np.array([is_keyframe(packet, codec) for packet in packets])
     decoder, found = None, []
     for i in range(len(packets)):

@@ -77,7 +77,6 @@ def values(name: str, pictures: np.ndarray) -> list[dict[str, Any]]:
 
 
 def ros_encoder(name: str, encoding: str) -> tuple[str, str, bytes, Callable[[int, dict[str, Any]], bytes]]:
-    """Type, schema encoding, schema and encoder of foxglove_msgs in ROS 1 or 2."""
     one = encoding == "ros1"
     store = get_typestore(Stores.ROS1_NOETIC if one else Stores.ROS2_HUMBLE)
     text = ("time timestamp\n" if one else "builtin_interfaces/Time timestamp\n") + FIELDS[name]

@@ -60,7 +60,6 @@ def put(path: Path, name: str) -> str:
 
 
 def large_run(folder: Path, **options) -> Path:
-    """Three episodes of 20 pictures of 64×64, with bursts of a large topic between the pictures."""
     burst = np.random.default_rng(0).bytes(60_000)
     more = [(*LIDAR, at, burst) for at in np.linspace(0.2, 10, 12).tolist() for _ in range(6)]
     return mcap(folder, make_run(60, pause_after=(20, 40), side=64), more, chunk_size=20_000, **options)
@@ -188,7 +187,6 @@ def test_a_copy_that_has_no_space_is_refused(tmp_path, monkeypatch) -> None:
 
 
 def contents(folder: Path) -> list:
-    """All that the shards hold, but for the recording's path."""
     shards = ShardSet(folder)
     episodes = shards.episodes.drop_columns("source").to_pylist()
     rows = [shards.episode_rows(episode["episode_index"]) for episode in episodes]

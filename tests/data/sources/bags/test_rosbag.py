@@ -303,9 +303,8 @@ def test_every_numeric_key_of_inspect_can_be_converted(numbers_bag: Path) -> Non
     assert len(keys) >= 4
     for key in keys:
         names = f", names: [{', '.join(key.names)}]" if key.names else ""
-        assert (
-            read(numbers_bag, keyed(key.key, key.shape[0], names)).actions[0].values.shape[1] == key.shape[0]
-        )
+        values = read(numbers_bag, keyed(key.key, key.shape[0], names)).actions[0].values
+        assert values.shape[1] == key.shape[0]
 
 
 def test_inspect_tells_of_stamps_that_repeat_pause_or_go_back(tmp_path: Path) -> None:

@@ -17,7 +17,6 @@ from tests.hostile import Edit, Row, untouched
 
 
 def write(path: Path, value: object, protocol: int) -> Path:
-    """A file as numpy writes it, with any protocol of pickle."""
     with path.open("wb") as file:
         facts = {"descr": "|O", "fortran_order": False, "shape": ()}
         np.lib.format.write_array_header_1_0(file, facts)
@@ -82,8 +81,6 @@ def test_code_in_a_file_is_refused_and_does_not_run(protocol, tmp_path):
 
 
 def pickled(content: bytes) -> Edit:
-    """Return an edit that makes a file of numpy's whose objects are this pickle."""
-
     def edit(path: Path) -> None:
         with path.open("wb") as file:
             np.lib.format.write_array_header_1_0(file, {"descr": "|O", "fortran_order": False, "shape": ()})

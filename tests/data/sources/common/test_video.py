@@ -238,7 +238,6 @@ def test_resizing_is_opencvs_on_a_packed_copy_bit_for_bit(
 
 
 def resize_input(raw: np.ndarray, camera: Camera) -> np.ndarray:
-    """The picture as it is handed to the resizing: colours, flip, rotation and crop done."""
     if camera.color == "bgr":
         raw = raw[..., ::-1]
     if camera.flip == "horizontal":

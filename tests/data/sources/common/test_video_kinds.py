@@ -29,7 +29,6 @@ def make(
     ticks: int = 10,
     **container: str,
 ) -> Path:
-    """A video of N pictures by that encoder; `times` in ticks of 1/`ticks` s."""
     base = Fraction(1, ticks)
     with av.open(str(path), "w", options=container) as out:
         stream = out.add_stream(codec, rate=10, options=options)
@@ -44,8 +43,6 @@ def make(
 
 
 def without(box: bytes) -> Callable[[Path], Path]:
-    """An H.264 MP4 with B-frames whose table of that name is gone."""
-
     def made(folder: Path) -> Path:
         path = encode(folder / "v.mp4", range(N))
         content = path.read_bytes()
@@ -207,7 +204,6 @@ def patches(matrix: int, full: bool, bits: int) -> list[np.ndarray]:
 
 
 def film(path: Path, matrix: int, full: bool, codec: str = "libx264", kind: str = "yuv420p") -> Path:
-    """A video of three frames that show the colours and state matrix and range."""
     spread = FULL if full else LIMITED
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=10, options=OPTIONS[codec])

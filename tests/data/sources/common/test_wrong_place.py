@@ -76,9 +76,7 @@ def test_the_same_fault_of_many_episodes_is_told_once(tmp_path: Path) -> None:
     data = next((folder / "data").rglob("*.parquet"))
     data.write_bytes(b"")
     found = [one for one in open_source("lerobot").inspect(str(folder)).findings if one.check == "readable"]
-    assert len(found) == 1 and found[0].message.startswith(
-        "3 of 3 sampled episodes, such as episode_000000: "
-    )
+    assert len(found) == 1 and found[0].message.startswith("3 of 3 sampled episodes, such as episode_000000:")
     assert str(data) in found[0].message
 
 

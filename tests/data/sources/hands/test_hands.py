@@ -35,7 +35,6 @@ BOTH = ("left/center", "right/center")
 
 
 def check_run(folder: Path, robot, episode_id: str, frames: range) -> None:
-    """An episode's pictures, actions (next) and states are those of its labels, the last left out."""
     source = open_source("hands")
     ref = {ref.id: ref for ref in source.index(str(folder), robot)}[episode_id]
     episode = open_source("hands").read(str(folder), episode_id, robot)

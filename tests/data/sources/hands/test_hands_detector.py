@@ -62,7 +62,6 @@ def finder(models: Path) -> MediaPipeHands:
 
 @pytest.fixture(scope="module")
 def short(real_data: Path, models: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with 24 frames of the real clip, small: both hands are open before the camera."""
     file = VideoFile(real_data / "hands" / "demo3.mp4")
     pictures = [cv2.resize(picture, (426, 240)) for picture in file.frames(range(100, 124))]
     folder = tmp_path_factory.mktemp("short")
@@ -175,9 +174,7 @@ def test_there_is_at_most_one_hand_a_side(p_right: list[float], sides: list[str 
 def test_raised_hands_are_found_on_their_side_with_the_wrist_below(real_data, finder) -> None:
     for name, side in RAISED.items():
         finder.reset()
-        hands = {
-            hand.side: hand for hand in finder.detect(picture_of(real_data / f"hands/images/{name}.jpg"))
-        }
+        hands = {one.side: one for one in finder.detect(picture_of(real_data / f"hands/images/{name}.jpg"))}
         assert side in hands, name
         points = hands[side].points
         assert hands[side].score > 0.9 and (points > 0).all() and (points < 1).all()
@@ -266,7 +263,6 @@ class Blinking:
 
 @pytest.fixture
 def blinking(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with a video of 20 frames, looked at by that detector instead of a real one."""
     models = type("Models", (), {"digest": "made"})()
     target = "hma_data.sources.hands.source.HandsSource._models"
     monkeypatch.setattr(target, lambda self, layout: (Blinking(), models))

@@ -18,7 +18,6 @@ from tests.data.hdf5_files import H, T, W, embodiment, fill, pictures
 
 
 def one(path: Path, key: str = "obs/agentview_image", **written: Any) -> Path:
-    """A file of one demo whose images are replaced by what is given."""
     with h5py.File(path / "a.h5", "w") as file:
         group = file.create_group("data/demo_0")
         fill(group)
@@ -34,7 +33,6 @@ def shown(path: Path, indices: Any = range(T), **layout: str) -> np.ndarray:
 
 @pytest.fixture
 def maniskill(tmp_path: Path) -> Path:
-    """Two trajectories with an observation after the last action, and the JSON beside."""
     path = tmp_path / "trajectory.rgb.pd_ee_delta_pose.h5"
     with h5py.File(path, "w") as file:
         for i in range(2):

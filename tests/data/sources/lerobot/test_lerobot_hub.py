@@ -27,7 +27,6 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.fixture
 def hub(tmp_path: Path, folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
-    """A Hub with a dataset of version 2, an older revision of it, and one of version 3; an empty cache."""
     with serve() as server:
         server.add_folder("team/two", "main", folders["v2"])
         server.add_folder("team/two", "v0.9", folders["old"])

@@ -96,7 +96,6 @@ def write(
 
 
 def many_files(writer: Any) -> None:
-    """Files so small that episodes are spread over several, and chunks of two files."""
     writer.meta.info.chunks_size = 2
     writer.meta.info.data_files_size_in_mb = 1e-6  # a file that is being written looks empty
     writer.meta.info.video_files_size_in_mb = 1e-6
@@ -134,13 +133,11 @@ def theirs(root: Path) -> Any:
 
 
 def as_picture(tensor: Any) -> np.ndarray:
-    """Return (H, W, C) uint8 of lerobot's (C, H, W): bytes of a video, parts of one of a still picture."""
     values: np.ndarray = tensor.permute(1, 2, 0).numpy()
     return values if values.dtype == np.uint8 else np.rint(values * 255).astype(np.uint8)
 
 
 def rows_of(items: list[Any], robot: Embodiment, root: Path) -> Iterator[tuple[Any, Any, int]]:
-    """Yield each frame as lerobot has it, the episode as we have it, and the row in it."""
     source, at = open_source("lerobot"), 0
     for ref in source.index(str(root), robot):
         episode = source.read(str(root), ref.id, robot)
@@ -238,7 +235,6 @@ def test_episodes_deleted_by_lerobot_leave_the_others_equal(tmp_path: Path) -> N
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A set of one camera whose episodes share one video."""
     features = {key: FEATURES[key] for key in ("action", CAM)}
     return write(tmp_path_factory.mktemp("plain") / "set", features, **encoder("h264"))
 
@@ -306,7 +302,6 @@ def as_v21(root: Path, out: Path, row_hz: float = FPS) -> Path:
 
 @pytest.fixture(scope="module")
 def apart(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A set of one camera with a video for each episode."""
     features = {key: FEATURES[key] for key in ("action", CAM)}
     root = tmp_path_factory.mktemp("apart") / "set"
     return write(root, features, many_files, **encoder("h264"))

@@ -390,7 +390,6 @@ def test_an_unknown_episode(tmp_path, name):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """A folder, its shard's bytes and the episodes' actions."""
     folder = toy(tmp_path_factory.mktemp("whole") / "d", (3, 2, 3))
     actions = {name: read(folder, name).actions[0].values for name in RLDS.episode_ids(str(folder))}
     return folder, next(folder.glob("*.tfrecord*")).read_bytes(), actions

@@ -19,7 +19,6 @@ EPISODES, LENGTH = 6, 8  # of each shard; steps
 
 @pytest.fixture
 def ranges(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int, int]]:
-    """The ranges of bytes of record files that were read, with the files' numbers; blocks are small."""
     monkeypatch.setattr(blocks, "BLOCK", 1024)
     monkeypatch.setattr(blocks, "BLOCKS_AHEAD", 4)
     monkeypatch.setattr(records, "READ_AHEAD", 64)

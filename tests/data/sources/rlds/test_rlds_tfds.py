@@ -249,7 +249,6 @@ def test_a_simulator_recorded_as_rlds_is_read_by_tfds(toy, tmp_path):
 
 
 def _is_what_tfds_reads(toy: ModuleType, folder: Path, robot: Embodiment) -> list[dict[str, Any]]:
-    """Check that TFDS reads the pictures and commands that we read; return its episodes."""
     found: list[dict[str, Any]] = toy.episodes(folder, "train")
     names = RLDS.episode_ids(str(folder))
     assert len(found) == len(names)
