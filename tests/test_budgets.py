@@ -45,7 +45,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/worlds": (1_524, 11_736, 6),
 }
 PRODUCT_LINES, PRODUCT_NODES = 65_635, 520_680
-TEST_LINES = 49_266
+TEST_LINES = 48_357
 DOC_WORDS = 41_990
 
 

@@ -1,6 +1,5 @@
 """The model's configuration and action spaces."""
 
-import dataclasses
 import json
 from types import SimpleNamespace
 
@@ -21,12 +20,6 @@ def test_json_roundtrip_keeps_every_field() -> None:
     )
     assert HMAConfig.from_json(json.dumps(config.to_json())) == config
     assert HMAConfig.from_json(config.to_json()) == config
-
-
-def test_defaults_are_the_paper_size() -> None:
-    config = HMAConfig()
-    assert (config.layers, config.width, config.heads, config.frames) == (32, 256, 8, 12)
-    assert config.vocab_size == 262144 and config.tokens_per_frame == 256
 
 
 def test_continuous_tokens_are_patches() -> None:
@@ -59,11 +52,6 @@ def test_bad_values_name_their_field(change: dict, name: str) -> None:
 def test_unknown_field_is_refused_by_name() -> None:
     with pytest.raises(RecipeError, match=r"model\.depth"):
         HMAConfig.from_json({"depth": 4})
-
-
-def test_config_cannot_be_changed() -> None:
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        HMAConfig().layers = 4  # type: ignore[misc]
 
 
 def test_action_space_of_an_embodiment_and_its_stats() -> None:

@@ -11,11 +11,12 @@ import pytest
 
 from hma_data.episodes.align import to_clip
 from hma_data.errors import UsageError
+from hma_data.loading.dataset import MixtureDataset
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from hma_data.sources.base import open_source
 from recipes.bench import harness as bench
-from recipes.bench import loader, peers, sources
+from recipes.bench import loader, peers, scale, sources
 from recipes.bench.sources import CASES, actions, scene
 from tests.data.loading.test_pools import SMALL
 
@@ -164,3 +165,37 @@ def test_a_peer_must_give_our_windows_and_a_missing_one_is_named(tmp_path, monke
     )
     with pytest.raises(RuntimeError, match="shifted gives other windows"):
         peers.run_peer("shifted", folder, settings)
+
+
+FEW = {"episodes": 120, "embodiments": 2, "folder": ""}
+
+
+@pytest.mark.slow
+def test_every_step_reports_its_time_and_memory() -> None:
+    results = scale.run(FEW)
+    assert [one["step"] for one in results] == ["plan", "write", "read", "resume", "mixture"]
+    assert all(one["episodes"] == 120 and one["peak_rss_mib"] > 0 for one in results)
+
+
+def test_the_sets_hold_what_was_planned(tmp_path: Path) -> None:
+    scale._make(str(tmp_path), FEW)
+    for step in scale.STEPS.values():
+        step(tmp_path, FEW)
+    planned = {robot.id: plan for robot, _, plan in scale._planned(FEW)}
+    assert sum(plan.episodes for plan in planned.values()) == 120
+    for name, plan in planned.items():
+        shards = ShardSet(tmp_path / name)
+        assert shards.manifest.plan == plan.facts
+        assert sum(split["frames"] for split in shards.manifest.splits.values()) == plan.frames
+        assert len(shards.episodes) == plan.episodes
+    windows = MixtureDataset([tmp_path / name for name in planned], 32).mixture.counts
+    assert len(windows) == 2 and all(count > 0 for count in windows)
+
+
+def test_a_set_that_lacks_a_shard_is_not_whole(tmp_path: Path) -> None:
+    one = FEW | {"episodes": 40, "embodiments": 1}
+    scale._make(str(tmp_path), one)
+    scale._write(tmp_path, one)
+    next(tmp_path.glob("robot_0/train/*.parquet")).unlink()
+    with pytest.raises(RuntimeError, match="not whole"):
+        scale._resume(tmp_path, one)

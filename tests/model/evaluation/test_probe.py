@@ -6,8 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
+from hma_data.lab import pusht, truth
 from hma_data.lab.family.look import SIZE
-from hma_model.evaluation.probe import Probe, fit, state_errors
+from hma_data.lab.simulator import LabSimulator
+from hma_model.evaluation.probe import Probe, TeeFinder, fit, state_errors
 from recipes.bench.drift import wholeness
 
 RED, BLUE, PAPER = (200, 30, 40), (40, 60, 200), (225, 225, 215)
@@ -66,3 +68,41 @@ def test_the_same_seed_gives_the_same_probe():
     pictures, parts = scenes(60, 5)
     one, other = (fit(pictures, parts, driven=2, steps=3, seed=7).read(pictures[:4]) for _ in range(2))
     np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("robot", truth.PUSHERS)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_tee_of_a_picture_is_found_to_a_pixel(robot: str, seed: int) -> None:
+    finder, simulator = TeeFinder.of(robot), LabSimulator(robot)
+    assert finder is not None
+    for number in range(12):
+        simulator.reset(seed, number)
+        picture = simulator.picture().astype(np.float64)
+        _, parts = truth.parts_of(simulator.simulation)
+        x, y = (finder.within(parts[None])[0, 1] * len(picture) / truth.SIZE).astype(int)
+        found = finder.find(np.linalg.norm(picture - picture[y, x], axis=-1) < 30)
+        assert found is not None
+        assert np.linalg.norm(found - parts[1:], axis=-1).max() < 1.5, number
+
+
+def test_a_tee_of_few_pixels_is_not_found() -> None:
+    finder = TeeFinder.of("pusht_fast")
+    assert finder is not None and TeeFinder.of("rails_03") is None
+    pixels = np.zeros((64, 64), bool)
+    assert finder.find(pixels) is None
+    pixels[20:24, 20:26] = True
+    assert finder.find(pixels) is None
+
+
+def test_the_middles_of_the_bars_lie_within_the_tee() -> None:
+    finder = TeeFinder.of("pusht_slow")
+    assert finder is not None
+    simulator = LabSimulator("pusht_slow")
+    simulator.reset(3, 2)
+    _, parts = truth.parts_of(simulator.simulation)
+    (within,) = finder.within(parts[None])
+    np.testing.assert_allclose(within[0], parts[0])
+    pose = pusht.tee_pose(parts[1:])
+    arena = within[1:] / pusht.PX - pose[:2]
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    assert (pusht.tee().distance(arena @ np.array([[c, -s], [s, c]])) < -10).all()

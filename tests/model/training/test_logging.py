@@ -18,13 +18,14 @@ from tensorboard.compat.tensorflow_stub.pywrap_tensorflow import PyRecordReader_
 
 from hma_data.errors import MissingDependencyError, OutputError
 from hma_model.checkpoint.folder import resolve
+from hma_model.cli.train import _print
 from hma_model.evaluation.plots import loss_curves
 from hma_model.training import logging
 from hma_model.training.logging import RunLog, read_metrics
-from hma_model.training.loop import _result, train
+from hma_model.training.loop import TrainResult, _result, train
 from hma_model.training.recipe import make_recipe
 from hma_model.training.report import write_report
-from tests.model.robots import Blocks
+from tests.model.robots import CONFIG, Blocks, make_model, save
 from tests.model.runs import TINY, train_until
 
 SEEN = {"report": True, "pictures": 2, "track": ["tensorboard"]}
@@ -277,3 +278,16 @@ def test_the_last_line_has_the_last_evaluation(tmp_path, capsys):
         log.evaluation(facts(2, loss=1.5))
     last = capsys.readouterr().err.splitlines()[-1]
     assert "training: 2/2 steps" in last and "validation 1.500" in last
+
+
+@pytest.mark.parametrize(("merge", "unit"), [(1, "token"), (2, "square of 2×2 tokens")])
+def test_the_held_out_loss_names_what_it_is_of(merge, unit, tmp_path, capsys) -> None:
+    config = CONFIG.replace(grid=(2, 4), merge=merge, tokenizer={**CONFIG.tokenizer, "grid": [2, 4]})
+    save(tmp_path / "made", {"arm": 2}, model=make_model({"arm": 2}, config=config))
+    _print(
+        TrainResult(
+            tmp_path, tmp_path / "made", 3, [], [], masked_val_loss=2.0, baseline=4.0, interrupted=False,
+            skipped=0, seconds=1.0,
+        )
+    )  # fmt: skip
+    assert f"held-out loss 2.0000 nats per {unit}; baseline (token frequencies)" in capsys.readouterr().out
