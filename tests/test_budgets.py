@@ -29,7 +29,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model": (537, 3_349, 4),
     "hma_model/benchmark": (832, 7_108, 5),
     "hma_model/checkpoint": (936, 7_099, 5),
-    "hma_model/cli": (1_768, 11_268, 12),
+    "hma_model/cli": (1_752, 11_257, 12),
     "hma_model/demo": (477, 4_030, 4),
     "hma_model/evaluation": (4_422, 34_952, 24),
     "hma_model/export": (1_172, 9_349, 9),
@@ -44,9 +44,9 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_690, 30_256, 20),
     "hma_model/worlds": (1_524, 11_736, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_635, 520_680
+PRODUCT_LINES, PRODUCT_NODES = 65_619, 520_669
 TEST_LINES = 48_357
-DOC_WORDS = 41_990
+DOC_WORDS = 41_710
 
 
 @cache

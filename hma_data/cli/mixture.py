@@ -22,7 +22,7 @@ _share = partial(Option, rich_help_panel="Weights, groups and caps")
 def mixture(
     folders: Annotated[list[str], Argument(help="Shard sets.")],
     temperature: Annotated[
-        float | None, Option(help="Temperature τ: 1 follows set sizes, large is uniform; default 3 (val: 4).")
+        float | None, Option(help="τ: 1 is proportional to set size, larger is flatter; default 3 (val: 4).")
     ] = None,
     frames: Annotated[int, Option(min=1, help="Frames T per window.")] = 12,
     split: Annotated[Literal["train", "val"], Option(help="Split to draw from.")] = "train",

@@ -124,7 +124,7 @@ def shards_verify(
     quick: Annotated[bool, Option("--quick", help="Check only sizes and footers.")] = False,
     json: Json = False,
 ) -> None:
-    """Check every hash, row count and invariant.
+    """Check every hash, row count and invariant of shard sets.
 
     Example: hma shards verify shards/my_arm
     """
@@ -233,7 +233,7 @@ def shards_split(
     ] = None,
     seed: Annotated[int, Option(help="Seed of the split.")] = 0,
     by: Annotated[
-        Literal["episode", "instruction", "source"], Option(help="Unit that stays in one split.")
+        Literal["episode", "instruction", "source"], Option(help="Unit kept in one split.")
     ] = "episode",
     workers: Workers = None,
     json: Json = False,

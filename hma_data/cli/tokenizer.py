@@ -53,7 +53,7 @@ def _print_list(entries: list[Any]) -> None:
 @tokenizer_app.command("train")
 def tokenizer_train(
     recipe: Annotated[Path, Argument(help="A YAML of recipes/tokenizer.")],
-    overrides: Annotated[list[str] | None, Argument(metavar="KEY=VALUE", help="Dotted recipe keys.")] = None,
+    overrides: Annotated[list[str] | None, Argument(metavar="KEY=VALUE", help="Keys of the recipe.")] = None,
     out: Annotated[Path, Option(help="Output weights.")] = Path("tokenizer.safetensors"),
     device: Device = "cpu",
     workers: Annotated[int, Option(min=0, help="Threads that prefetch crops.")] = 0,
@@ -89,7 +89,7 @@ def tokenizer_train(
 def tokenizer_eval(
     tokenizer: Annotated[str, Argument(help="Name of the tokenizer.", autocompletion=tokenizers)],
     data: Annotated[list[str], Argument(help="Images, videos, folders of them, recordings, shard sets.")],
-    embodiment: Annotated[str | None, robot_option("DATA are recordings of this robot: id or YAML.")] = None,
+    embodiment: Annotated[str | None, robot_option("Robot of the recordings: id or YAML file.")] = None,
     weights: Annotated[str | None, Option(help="Tokenizer weights other than the default.")] = None,
     frames: Annotated[int, Option(min=1, help="Frames of each video or episode, evenly spaced.")] = 64,
     lpips: Annotated[
@@ -136,7 +136,7 @@ def tokenizer_eval(
 @tokenizer_app.command("fit")
 def tokenizer_fit(
     data: Annotated[list[str], Argument(help="Images, videos, folders of them, recordings, shard sets.")],
-    embodiment: Annotated[str | None, robot_option("DATA are recordings of this robot: id or YAML.")] = None,
+    embodiment: Annotated[str | None, robot_option("Robot of the recordings: id or YAML file.")] = None,
     colors: Annotated[int, Option(min=2, max=255, help="Number of colours; fewer are learned faster.")] = 32,
     frames: Annotated[int, Option(min=1, help="Frames of each video or episode, evenly spaced.")] = 16,
     out: Annotated[Path, Option(help="Output weights.")] = Path("colors.safetensors"),

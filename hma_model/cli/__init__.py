@@ -34,6 +34,7 @@ from hma_model.cli.options import (
     Device,
     Precision,
     SampleSteps,
+    Seed,
     Split,
     Temperature,
     UnmaskSteps,
@@ -206,7 +207,7 @@ def generate(
     precision: Precision = "float32",
     compile: Compile = False,
     device: Device = "auto",
-    seed: Annotated[int, Option(min=0, help="Seed of the rollout.")] = 0,
+    seed: Seed = 0,
     cameras: Cameras = None,
 ) -> None:
     """Write a video: a recording next to the prediction from its first frames and its actions.

@@ -21,7 +21,7 @@ def export(
     starts: Annotated[int, Option(min=1, max=20, help="Start scenes per robot.")] = 3,
     unmask_steps: UnmaskSteps = 2,
     half: Annotated[
-        bool, Option("--half/--float32", help="Weights in float16 if that costs less than 0.1 dB.")
+        bool, Option("--half/--float32", help="Store weights in float16 if that costs less than 0.1 dB.")
     ] = True,
     runtime: Annotated[
         Path | None,

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from hma_model.checkpoint.folder import Checkpoint
 
 Saved = Annotated[Path, Argument(help="A checkpoint, or a run's folder.")]
-Revision = Annotated[str | None, Option("--revision", help="Branch, tag or commit.")]
+Revision = Annotated[str | None, Option(help="Branch, tag or commit.")]
 Private = Annotated[bool, Option("--private", help="Create new repositories as private.")]
 hub_app = typer.Typer(no_args_is_help=True, help="Publish and pull checkpoints, one robot at a time.")
 

@@ -20,39 +20,25 @@ Checkpoint = Annotated[
     str, Argument(help="A checkpoint, a run's folder, or a hub repo (org/name[@revision]).")
 ]
 Embodiments = Annotated[list[str] | None, Option("--embodiment", "-e", help="Only this robot; repeatable.")]
-OfCheckpoint = Annotated[str, Option("--checkpoint", help="A checkpoint, a run's folder, or a hub repo.")]
+OfCheckpoint = Annotated[str, Option(help="A checkpoint, a run's folder, or a hub repo.")]
 Data = Annotated[Path, Argument(help="A shard set.")]
-Split = Annotated[Literal["train", "val"], Option("--split", help="Split of the windows.")]
-UnmaskSteps = Annotated[
-    int, Option("--unmask-steps", min=1, help="Decoding passes per frame of a discrete model.")
-]
+Split = Annotated[Literal["train", "val"], Option(help="Split of the windows.")]
+UnmaskSteps = Annotated[int, Option(min=1, help="Decoding passes per frame of a discrete model.")]
 Temperature = Annotated[
-    float | None,
-    Option("--temperature", min=0, help="Sampling temperature; 0 is greedy; default: 0.5, or 0 for latents."),
+    float | None, Option(min=0, help="Sampling temperature; 0 is greedy; default: 0.5, or 0 for latents.")
 ]
-SampleSteps = Annotated[
-    int | None, Option("--sample-steps", min=1, help="DDIM steps of a continuous model; default: its own.")
-]
+SampleSteps = Annotated[int | None, Option(min=1, help="DDIM steps of a continuous model; default: its own.")]
 Precision = Annotated[
     Literal["float32", "bf16", "int8"],
-    Option(
-        "--precision",
-        help="Precision in rollouts; bf16 and int8 (CPUs with VNNI) need hardware support.",
-    ),
+    Option(help="Precision in rollouts; bf16 and int8 (CPUs with VNNI) need hardware support."),
 ]
 Compile = Annotated[
     bool, Option("--compile", help="Compile the trunk: takes a minute, speeds up rollouts on a GPU.")
 ]
-Device = Annotated[
-    str,
-    Option("--device", help="Device: auto (a GPU if available), cpu, cuda or mps."),
-]
+Device = Annotated[str, Option(help="Device: auto (a GPU if available), cpu, cuda or mps.")]
 Cameras = Annotated[
-    str | None,
-    Option("--cameras", metavar="NAME[,NAME…]", help="Input cameras of the model; default: as in training."),
+    str | None, Option(metavar="NAME[,NAME…]", help="Input cameras of the model; default: as in training.")
 ]
-
-
 Seed = Annotated[int, Option(min=0, help="Random seed.")]
 
 

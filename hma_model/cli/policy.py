@@ -22,15 +22,6 @@ from hma_model.cli.options import (
     kept,
 )
 
-MaxError = Annotated[
-    float | None,
-    Option(
-        min=0,
-        help="Maximum expected state error at the end, in px of 128: augment drops episodes above it; "
-        "policy-eval also reports the judge without them.",
-    ),
-]
-
 
 def policy_eval(
     embodiment: Annotated[
@@ -55,7 +46,7 @@ def policy_eval(
         str,
         Option(
             help="Success criterion: moved, reached or placed; moved=8 sets the limit in px. For robots "
-            "without a simulator a reward model of lerobot: a folder or hub repo."
+            "without a simulator, a lerobot reward model: a folder or hub repo."
         ),
     ] = "moved",
     source: Annotated[
@@ -65,7 +56,10 @@ def policy_eval(
             help="Shards with success labels, for a reward model; default: those of the training run.",
         ),
     ] = None,
-    max_error: MaxError = None,
+    max_error: Annotated[
+        float | None,
+        Option(min=0, help="Also report the judge for episodes of at most this expected error, px of 128."),
+    ] = None,
     unmask_steps: UnmaskSteps = 2,
     temperature: Temperature = None,
     precision: Precision = "float32",
@@ -139,9 +133,12 @@ def augment(
         str, Option(help="Actions: replay, perturb=SIGMA (noise, in std), or a policy of hma policy-eval.")
     ] = "replay",
     keep: Annotated[float, Option(help="Share of episodes to keep, lowest uncertainty first.")] = 0.5,
-    max_error: MaxError = None,
+    max_error: Annotated[
+        float | None,
+        Option(min=0, help="Drop episodes with a larger expected state error at the end, in px of 128."),
+    ] = None,
     judge: Annotated[
-        str, Option(help="Keep only successes. The judge: moved, moved=PX, reached, placed, a reward model.")
+        str, Option(help="Keep only successes, judged by moved, moved=PX, reached, placed, a reward model.")
     ] = "",
     lerobot: Annotated[Path | None, Option(help="Also write a LeRobotDataset v3.0 to this folder.")] = None,
     unmask_steps: UnmaskSteps = 2,
@@ -152,7 +149,7 @@ def augment(
     device: Device = "auto",
     json: Json = False,
 ) -> None:
-    """Generate synthetic episodes with the world model, as shards and as a LeRobotDataset.
+    """Generate synthetic episodes with the world model, as shards and, with --lerobot, as a LeRobotDataset.
 
     Example: hma augment rails_03 synthetic/rails_03 --episodes 64 --commands perturb=0.3
     """
@@ -214,7 +211,7 @@ def label_actions(
 ) -> None:
     """Infer the actions of action-free video: write labelled shards, print the error on recorded actions.
 
-    Example: hma label-actions film --checkpoint runs/inverse -e mover_04 --out labelled/mover_04
+    Example: hma label-actions videos --checkpoint runs/inverse -e mover_04 --out labelled/mover_04
     """
     from hma_data.shards.manifest import MANIFEST, QUARANTINE
     from hma_model.synthetic.labels import label_actions as run

@@ -20,7 +20,7 @@ Words = Annotated[
     list[str] | None,
     Argument(metavar="DATA|KEY=VALUE", help="Shard sets, and recipe keys such as model.layers=4."),
 ]
-Out = Annotated[Path | None, Option("--out", help="The run's folder; required, here or as out=DIR.")]
+Out = Annotated[Path | None, Option(help="The run's folder; required, here or as out=DIR.")]
 Force = Annotated[bool, Option("--force", help="Resume even if the recipe or the shards changed.")]
 MODELS = "Models"  # the panel of `hma --help`
 STOPPED = "the run's checkpoints are kept; the same command continues from the newest"
