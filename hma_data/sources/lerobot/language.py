@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from hma_data.episodes.episode import Floats
-from hma_data.errors import SourceError
+from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.lerobot.metadata import Metadata
 from hma_data.sources.lerobot.rows import Rows
 
@@ -28,7 +28,18 @@ _STAGED = "plan"  # under this name lerobot's writer takes rows of any style
 
 
 def language_of(meta: Metadata, rows: Rows, times: Floats) -> list[dict[str, Any]]:
-    """Return the items of an episode in the order of their times (T,)."""
+    """Return the items of an episode in the order of their times (T,).
+
+    Raises:
+        EpisodeError: its columns of language are not as lerobot writes them.
+    """
+    try:
+        return _items(meta, rows, times)
+    except (KeyError, TypeError, ValueError) as fault:
+        raise EpisodeError(rows.path, f"its language is not as lerobot writes it: {fault!r}") from fault
+
+
+def _items(meta: Metadata, rows: Rows, times: Floats) -> list[dict[str, Any]]:
     start = float(times[0])
     found: list[dict[str, Any]] = []
     if PERSISTENT in rows.columns:  # the same in every row

@@ -28,7 +28,8 @@ def film(frames: int, fps: int = 10) -> Edit:
 def column(name: str, content: list[Any]) -> Edit:
     def edit(path: Path) -> None:
         table = pq.read_table(path)
-        pq.write_table(table.set_column(table.column_names.index(name), name, pa.array(content)), path)
+        others = table.drop_columns([name] if name in table.column_names else [])
+        pq.write_table(others.append_column(name, pa.array(content)), path)
 
     return of(ROWS, edit)
 
@@ -64,6 +65,9 @@ ONE: dict[str, Row] = {  # one episode is refused
     "rows without numbers": (column("action", [[1.0, None]] * 12), "12 missing values"),
     "actions of text": (column("action", [["a", "b"]] * 12), "not numbers"),
     "actions of NaN": (column("action", [[1.0, float("nan")]] * 12), "not finite at frame 0"),
+    "language of numbers": (column("language_persistent", [3] * 12), "not as lerobot writes it: TypeError"),
+    "language without times": (column("language_persistent", [[{"a": 1}]] * 12), "writes it: KeyError"),
+    "subtasks of NaN": (column("subtask_index", [float("nan")] * 12), "not as lerobot writes it: ValueError"),
     "pictures elsewhere": (column(STILL, [{"path": "../../etc/passwd"}] * 12), "outside the dataset", STILLS),
 }
 ALL: dict[str, Row] = {  # no episode can be used
