@@ -418,6 +418,8 @@ def dataset(group: h5py.Group, key: str, where: str) -> h5py.Dataset:
     if isinstance(found, h5py.Group):
         inner = ", ".join(f"{key.strip('/')}/{name}" for name in list(found)[:8])
         raise EpisodeError(where, f"{key!r} is a group, not a dataset", f"it holds: {inner or 'nothing'}")
+    if not isinstance(found, h5py.Dataset):
+        raise EpisodeError(where, f"{key!r} is a named type, not a dataset")
     if is_elsewhere(found, group):
         raise EpisodeError(where, f"{key!r} keeps its values in other files", "write them into this one")
     if not found.shape:

@@ -26,6 +26,8 @@ _SLACK = 1e-3  # share of the range by which values may exceed it, as resizing c
 def image_kind(found: h5py.Dataset, layout: Hdf5Layout | None = None) -> str | None:
     """Return `raw` or `encoded` by dtype and shape; None where the dataset cannot hold images."""
     shape: tuple[int, ...] = found.shape or ()
+    if 0 in shape[1:]:
+        return None
     if found.dtype == np.uint8 or (layout and layout.pixels and found.dtype.kind in "fiu"):
         channels_first = layout.axes == "TCHW" if layout and layout.axes else shape[1:2] in ((1,), (3,))
         if len(shape) == 3 or (len(shape) == 4 and (shape[3] in _CHANNELS or channels_first)):

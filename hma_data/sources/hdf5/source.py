@@ -262,7 +262,7 @@ def _instruction(group: h5py.Group, key: str | None, where: str) -> str:
         found = member(group, key, where)
         if not isinstance(found, h5py.Dataset) or is_elsewhere(found, group):
             raise EpisodeError(where, f"{key!r} is not a text")
-        return text(found[()] if found.size == 1 else found[0] if found.shape else "")
+        return _first_text(found)
     for holder in (group, group.parent, group.file):
         for name in TEXT_KEYS:
             if said := text(holder.attrs.get(name)) or _single_text(inside(holder, name), group):
@@ -275,8 +275,13 @@ def _instruction(group: h5py.Group, key: str | None, where: str) -> str:
 
 def _single_text(found: Any, group: h5py.Group) -> str:
     """Return the text of a dataset of one value; empty where it is something else."""
-    is_single = isinstance(found, h5py.Dataset) and found.size == 1 and found.dtype.kind in "OS"
-    return text(found[()]) if is_single and not is_elsewhere(found, group) else ""
+    is_single = isinstance(found, h5py.Dataset) and found.size == 1 and not is_elsewhere(found, group)
+    return _first_text(found) if is_single else ""
+
+
+def _first_text(found: h5py.Dataset) -> str:
+    """Return the first text of a dataset; empty where it holds none."""
+    return text(found[(0,) * found.ndim]) if found.size and found.dtype.kind in "OS" else ""
 
 
 def _success(group: h5py.Group) -> bool | None:

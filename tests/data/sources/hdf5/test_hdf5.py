@@ -105,6 +105,13 @@ def test_the_file_that_macos_writes_beside_each_is_no_recording(demos: Path) -> 
     assert open_source("hdf5").episode_ids(str(demos.parent)) == before
 
 
+def test_an_instruction_without_rows_is_none(demos: Path) -> None:
+    with h5py.File(demos, "a") as file:
+        file["data/demo_0"].create_dataset("goal", shape=(0,), dtype="S8")
+    arm = embodiment(source__instruction="goal")
+    assert open_source("hdf5").read(str(demos), "demo_0", arm).instruction == ""
+
+
 def test_success_and_instruction_are_not_read_from_another_file(demos: Path) -> None:
     with h5py.File(demos.parent / "other.bin", "w") as other:
         other["rewards"], other["instruction"] = np.ones(3), "of another file"

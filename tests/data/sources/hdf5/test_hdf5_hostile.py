@@ -54,6 +54,11 @@ def virtual(demo: h5py.Group) -> None:
     demo.create_virtual_dataset("actions", layout)
 
 
+def a_type(demo: h5py.Group) -> None:
+    del demo["actions"]
+    demo["actions"] = np.dtype("f8")
+
+
 def packed_in_another_way(demo: h5py.Group) -> None:
     del demo[KEY]
     plan = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
@@ -124,6 +129,8 @@ ONE: dict[str, Row] = {  # one demo is refused
     "images of references": (put(KEY, shape=(T,), dtype=REF), "not colour images"),
     "images of regions": (put(KEY, shape=(T,), dtype=OBJECT), "not colour images"),
     "images of lists": (put(KEY, shape=(T,), dtype=LONG), "not colour images"),
+    "images of no height": (put(KEY, shape=(T, 0, W, 3), dtype="u1"), "not colour images"),
+    "actions that are a type": (changed(a_type), "'actions' is a named type"),
     "states of a simulator": (changed(without_pictures), "states and no images.*dataset_states_to_obs"),
     "an external link": (linked("actions", h5py.ExternalLink("secret.bin", "/in/actions")), FAR),
     "a link through another file": (linked(KEY, h5py.SoftLink("/away/image")), FAR),
