@@ -14,7 +14,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
     "hma_data": (701, 3_999, 7),
-    "hma_data/cli": (1_549, 11_105, 8),
+    "hma_data/cli": (1_549, 11_092, 8),
     "hma_data/conversion": (4_216, 31_495, 15),
     "hma_data/episodes": (1_695, 14_878, 9),
     "hma_data/hub": (517, 3_861, 3),

@@ -69,11 +69,11 @@ def _list(folder: str, found: "list[Found]", json: bool) -> None:
 
 
 def _print_inspection(report: dict[str, Any]) -> None:
-    episodes = f"{report['episodes']:,} episode{'s' if report['episodes'] != 1 else ''}"
+    episodes = human_count(report["episodes"], "episode")
     frames = f"{report['frames']:,} frames" if report["frames"] else None
     rate = f"{report['hz']:.4g} Hz" if report["hz"] else None
     facts = [report["format"], episodes, frames, rate, report["robot"]]
-    print(f"{report['uri']}: " + ", ".join(fact for fact in facts if fact))
+    say(f"{report['uri']}: " + ", ".join(fact for fact in facts if fact))
     lengths = sorted(report["lengths"])
     if lengths:
         told = "" if len(lengths) == report["episodes"] else f" of the {len(lengths):,} counted"

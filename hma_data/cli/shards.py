@@ -145,7 +145,7 @@ def shards_verify(
     else:
         for folder_name, problems in found.items():
             for problem in problems:
-                print(problem)
+                say(problem)
             say(f"{folder_name}: {human_count(len(problems), 'problem') if problems else 'no problems'}")
     raise typer.Exit(1 if any(found.values()) else 0)
 

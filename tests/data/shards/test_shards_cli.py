@@ -56,6 +56,8 @@ def test_verify_ends_with_1_when_it_finds_something(made: Path, tmp_path: Path) 
     assert "no problems" in run("verify", made, "--workers", 2).stdout
     assert json.loads(run("verify", made, "--quick", "--json").stdout) == {str(made): []}
     assert "manifest.json" in run("verify", tmp_path, code=1).stdout
+    (Path(shutil.copytree(made, tmp_path / "set")) / "\x1b[31m.txt").touch()
+    assert r"\x1b[31m.txt: is not in the manifest" in run("verify", tmp_path / "set", code=1).stdout
 
 
 def test_every_verb_that_makes_a_set_makes_a_sound_one(made: Path, tmp_path: Path) -> None:
