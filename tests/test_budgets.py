@@ -23,7 +23,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/loading": (1_281, 10_980, 6),
     "hma_data/registry": (1_287, 8_311, 6),
     "hma_data/shards": (2_551, 19_631, 11),
-    "hma_data/sources": (12_647, 105_346, 50),
+    "hma_data/sources": (12_648, 105_364, 50),
     "hma_data/storage": (1_649, 10_810, 11),
     "hma_data/tokenizers": (3_512, 25_984, 18),
     "hma_model": (537, 3_349, 4),

@@ -50,6 +50,7 @@ INSTRUCTION_FIELD = "task_description_english"  # the field of TASKS that gives 
 DEPTH = 4  # folders below a uri in which scenes are looked for
 MAX_WIDTH = 4096  # values of a sample
 SUCCESS_RATING = 2  # the lowest rating of a task that was done
+MAX_STAMP = 1 << 53  # milliseconds: below it, float64 holds every whole number
 STAMP_BYTES = 16  # of timestamps.npy for a frame, of colour and of depth, about
 _METADATA_KEYS = ("rating", "calib_quality", "finish_time", "calib")
 
@@ -218,7 +219,7 @@ def _rows(table: dict[Any, Any], serial: str, path: Path) -> list[tuple[int, Any
         rows = [(row.get("timestamp"), row) for row in content]
     else:
         rows = list(content.items()) if isinstance(content, dict) else []
-    if not rows or not all(isinstance(stamp, int) for stamp, _ in rows):
+    if not rows or not all(isinstance(stamp, int) and abs(stamp) < MAX_STAMP for stamp, _ in rows):
         raise EpisodeError(path, f"its samples of camera {serial} have no timestamps in whole milliseconds")
     return sorted(rows, key=lambda row: row[0])
 

@@ -120,6 +120,7 @@ ONE: dict[str, Row] = {
     "another width": (tcp(3, tcp=np.zeros(6)), "changes its number of values"),
     "lists for numbers": (tcp(3, tcp=[[1], [2]]), "holds list values, not numbers"),
     "words for times": (tcp(3, timestamp="x"), FEW),
+    "a time of 400 digits": (tcp(3, timestamp=10**400), FEW),
     "no samples": (table("tcp_base", lambda t: t.update({CAMERAS[0]: []})), FEW),
     "many values": (table("joint", lambda t: t[CAMERAS[0]].update(FAR)), "more than"),
     "a spoilt table": (of(TCP, whole("spoilt")), r"tcp_base\.npy: "),
