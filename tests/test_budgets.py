@@ -20,7 +20,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/hub": (517, 3_861, 3),
     "hma_data/inspection": (2_136, 20_030, 8),
     "hma_data/lab": (3_313, 30_478, 16),
-    "hma_data/loading": (1_281, 10_980, 6),
+    "hma_data/loading": (1_281, 10_880, 6),
     "hma_data/registry": (1_287, 8_311, 6),
     "hma_data/shards": (2_551, 19_631, 11),
     "hma_data/sources": (12_648, 105_364, 50),

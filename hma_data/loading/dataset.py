@@ -230,11 +230,10 @@ class MixtureDataset(IterableDataset[Batch]):
         if info and self._origin is None:
             self._origin = self._step  # the DataLoader asks worker 0 for this one
         while True:
-            lane, draws = self._step % self.lanes, self._draws(self._step)
             mine = (self._step - (self._origin or 0)) % workers == worker
             # Batches of a lane are cut ahead only where the lane stays with this worker.
-            batch = self._batch(self._step, self._taken[lane], self.lanes % workers == 0) if mine else None
-            self._step, self._taken = self._step + 1, _counted(self._taken, lane, draws)
+            batch = self._batch(ahead=self.lanes % workers == 0) if mine else None
+            self._advance()
             if batch is not None:
                 yield batch
 
@@ -251,9 +250,16 @@ class MixtureDataset(IterableDataset[Batch]):
             yield from self
             return
         for batch in self._made_ahead(workers):
-            lane, draws = self._step % self.lanes, self._draws(self._step)
-            self._step, self._taken = self._step + 1, _counted(self._taken, lane, draws)
+            self._advance()
             yield batch
+
+    def _advance(self) -> None:
+        """Count the windows of this step's batch as taken, and go to the next step."""
+        self._taken[self._step % self.lanes] += self._counts(self._draws(self._step))
+        self._step += 1
+
+    def _counts(self, draws: Ints) -> Ints:
+        return np.bincount(draws, minlength=len(self.sets))
 
     def _made_ahead(self, workers: int) -> Iterator[Batch]:
         """Yield the batches; while those of a lane are taken, its next ones are made."""
@@ -281,11 +287,11 @@ class MixtureDataset(IterableDataset[Batch]):
             for i in range(self.lanes):
                 lane, draws = (step + i) % self.lanes, self._drawn_ahead(step + i)
                 yield lane, draws, taken[lane].copy()
-                taken = _counted(taken, lane, draws)
+                taken[lane] += self._counts(draws)
             step += self.lanes * self._some
 
     def _made(self, lane: int, draws: Ints, taken: Ints) -> list[Batch]:
-        batches = self._cut(lane, draws, taken, self.batch_size)
+        batches = self._cut(lane, draws, taken)
         pin = cuda.is_available()  # so that copies to the GPU need not be waited for
         return [batch.pin_memory() if pin else batch for batch in batches]
 
@@ -315,19 +321,19 @@ class MixtureDataset(IterableDataset[Batch]):
     def _drawn_ahead(self, step: int) -> Ints:
         return np.concatenate([self._draws(step + i * self.lanes) for i in range(self._some)])
 
-    def _batch(self, step: int, taken: Ints, ahead: bool) -> Batch:
-        """Return batch `step`; with `ahead`, it is cut with the next ones of its lane."""
-        lane = step % self.lanes
+    def _batch(self, ahead: bool) -> Batch:
+        """Return this step's batch; with `ahead`, it is cut with the next ones of its lane."""
+        step, lane = self._step, self._step % self.lanes
         expected, batches = self._ahead.get(lane, (step, iter(())))
         batch = next(batches, None) if expected == step else None
         if batch is None:
             draws = self._drawn_ahead(step) if ahead else self._draws(step)
-            batches = self._cut(lane, draws, taken, self.batch_size)
+            batches = self._cut(lane, draws, self._taken[lane])
             batch = next(batches)
         self._ahead[lane] = step + self.lanes, batches
         return batch
 
-    def _cut(self, lane: int, draws: Ints, taken: Ints, size: int) -> Iterator[Batch]:
+    def _cut(self, lane: int, draws: Ints, taken: Ints) -> Iterator[Batch]:
         names = self.mixture.names
         windows_of = {}
         order, ends = np.argsort(draws, kind="stable"), np.cumsum(np.bincount(draws)).tolist()
@@ -337,7 +343,7 @@ class MixtureDataset(IterableDataset[Batch]):
                 windows_of[names[which]] = (order[start:end], cut)
         spec, views = next(iter(self.sets.values())).spec, view_count(self._cameras)
         drawn = [names[i] for i in draws]
-        return assemble(spec, drawn, windows_of, self._short, views, size)
+        return assemble(spec, drawn, windows_of, self._short, views, self.batch_size)
 
     def _sequence(self, lane: int, which: int) -> WindowSequence:
         if (lane, which) not in self._sequences:
@@ -398,13 +404,13 @@ class MixtureDataset(IterableDataset[Batch]):
                     f"was saved with {key} {state.get(key)}, but this run has {mine}",
                     "continue with the same settings and data, or start a new run",
                 )
-        step, taken = int(state["step"]), np.asarray(state["taken"], np.int64)
+        step = int(state["step"])
+        self._step, self._taken = step, np.array(state["taken"], np.int64)
         # Lanes of another rank took windows of other sets. What this rank had taken follows from its draws.
         if state.get("rank") != self.rank:
-            taken = np.zeros_like(taken)
-            for before in range(step):
-                taken = _counted(taken, before % self.lanes, self._draws(before))
-        self._step, self._taken = step, taken
+            self._step, self._taken = 0, np.zeros_like(self._taken)
+            while self._step < step:
+                self._advance()
         self._ahead.clear()  # cut after other windows
         self._origin = state.get("origin") if get_worker_info() else None
 
@@ -419,9 +425,3 @@ def _require_windows(decoder: RowDecoder) -> None:
         remedy = "raise target_hz in its YAML and run hma convert again, or use fewer frames"
     windows = f"no window of {index.frames} frames, {index.row_stride} rows apart"
     raise ShardError(decoder.shards.folder, f"has {windows}, in {decoder.split} ({episodes})", remedy)
-
-
-def _counted(taken: Ints, lane: int, draws: Ints) -> Ints:
-    counted = taken.copy()
-    counted[lane] += np.bincount(draws, minlength=taken.shape[1])
-    return counted
