@@ -18,7 +18,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/conversion": (4_216, 31_495, 15),
     "hma_data/episodes": (1_695, 14_878, 9),
     "hma_data/hub": (517, 3_861, 3),
-    "hma_data/inspection": (2_136, 20_030, 8),
+    "hma_data/inspection": (2_151, 20_103, 8),
     "hma_data/lab": (3_313, 30_478, 16),
     "hma_data/loading": (1_281, 10_880, 6),
     "hma_data/registry": (1_287, 8_311, 6),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_690, 30_256, 20),
     "hma_model/worlds": (1_524, 11_736, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_619, 520_669
-TEST_LINES = 48_357
+PRODUCT_LINES, PRODUCT_NODES = 65_655, 520_750
+TEST_LINES = 48_393
 DOC_WORDS = 41_710
 
 

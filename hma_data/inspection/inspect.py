@@ -6,6 +6,7 @@ sample of episodes read and aligned as this robot's; for a shard set those of it
 """
 
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -27,7 +28,7 @@ from hma_data.episodes.episode import Clip, Floats
 from hma_data.episodes.images import describe_resize
 from hma_data.episodes.movement import framing
 from hma_data.episodes.offset import Offset, measure
-from hma_data.errors import HMAError, SourceError
+from hma_data.errors import EpisodeError, HMAError, SourceError
 from hma_data.inspection.infer import action_offsets, held_actions, lacking
 from hma_data.registry.components import Sync
 from hma_data.registry.embodiment import ONE_INDEX, Embodiment, find
@@ -56,6 +57,18 @@ def _inspected(uri: str, robot: Embodiment | None, episodes: int) -> tuple[Sourc
         return source, source.inspect(uri, episodes)
     except SourceError as fault:
         raise of_another_format(uri, format_name, fault) from fault
+
+
+@contextmanager
+def _reading(name: str) -> Iterator[None]:
+    """Raise an error of any kind as an EpisodeError: a conversion refuses such an episode and goes on."""
+    try:
+        yield
+    except (HMAError, MemoryError):
+        raise
+    except Exception as fault:
+        text = f"stops its reader with {type(fault).__name__}: {fault}"
+        raise EpisodeError(name, text, "report this as a bug of the reader") from fault
 
 
 # -- hma inspect
@@ -113,9 +126,10 @@ def _fit(
         faults.append(fault)
     for name in names[:MAX_TRIED]:
         try:
-            clip = to_clip(source.read(uri, name, robot), robot)
-            frames = clip.frames_at(robot.primary_camera.name, np.arange(min(len(clip), 2)))
-            sizes = {name: clip.frames_at(name, np.arange(1)).shape[1:3] for name in clip.frame_indices}
+            with _reading(name):
+                clip = to_clip(source.read(uri, name, robot), robot)
+                frames = clip.frames_at(robot.primary_camera.name, np.arange(min(len(clip), 2)))
+                sizes = {name: clip.frames_at(name, np.arange(1)).shape[1:3] for name in clip.frame_indices}
             break
         except HMAError as fault:
             faults.append(fault)
@@ -349,9 +363,10 @@ def _episodes(
     clips: list[Clip] = []
     for name in chosen:
         try:
-            clip = to_clip(source.read(uri, name, robot), robot)
-            for camera in robot.cameras:  # can they be decoded? the inspection judged the frames
-                clip.frames_at(camera.name, np.array([len(clip) - 1]))
+            with _reading(name):
+                clip = to_clip(source.read(uri, name, robot), robot)
+                for camera in robot.cameras:  # can they be decoded? the inspection judged the frames
+                    clip.frames_at(camera.name, np.array([len(clip) - 1]))
             clips.append(clip)
         except HMAError as fault:
             refused.append((name, fault))

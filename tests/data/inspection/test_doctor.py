@@ -11,7 +11,10 @@ from skimage import data as skimage_data
 from typer.testing import CliRunner
 
 from hma_data.conversion.job import convert
-from hma_data.inspection.inspect import Finding, examine
+from hma_data.episodes.episode import Episode
+from hma_data.inspection.inspect import Finding, examine, inspect_recording
+from hma_data.registry.embodiment import Embodiment
+from hma_data.sources.hdf5.source import Hdf5Source
 from hma_model.cli import app
 from tests.conftest import ARM_YAML
 from tests.hostile import flip
@@ -173,6 +176,18 @@ def test_episodes_that_are_refused_come_with_what_to_do(tmp_path: Path) -> None:
     (first, *_) = examined(tmp_path, lambda file: None, yaml)
     assert (first.check, first.severity) == ("usable", "error")
     assert "dims" in first.remedy or "slice" in first.remedy
+
+
+def test_a_fault_of_the_reader_is_one_of_the_episode(tmp_path: Path, monkeypatch) -> None:
+    def read(self: Hdf5Source, uri: str, name: str, robot: Embodiment) -> Episode:
+        return {}[name]
+
+    monkeypatch.setattr(Hdf5Source, "read", read)
+    (first, *_) = examined(tmp_path, lambda file: None)
+    assert first.check == "usable" and "3 of 3 sampled episodes" in first.message
+    assert "stops its reader with KeyError: 'demo_0'" in first.message
+    report = inspect_recording(tmp_path / "toy.hdf5", tmp_path / "toy_arm.yaml")
+    assert any("stops its reader with KeyError" in one["message"] for one in report["findings"])
 
 
 def test_a_recording_without_a_camera_is_no_robots(tmp_path: Path) -> None:
