@@ -31,7 +31,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/checkpoint": (936, 7_099, 5),
     "hma_model/cli": (1_752, 11_257, 12),
     "hma_model/demo": (477, 4_030, 4),
-    "hma_model/evaluation": (4_422, 34_952, 24),
+    "hma_model/evaluation": (4_430, 34_999, 24),
     "hma_model/export": (1_172, 9_349, 9),
     "hma_model/generation": (1_643, 13_265, 9),
     "hma_model/hub": (1_061, 8_204, 6),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_690, 30_256, 20),
     "hma_model/worlds": (1_524, 11_736, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_655, 520_750
-TEST_LINES = 48_393
+PRODUCT_LINES, PRODUCT_NODES = 65_663, 520_797
+TEST_LINES = 48_405
 DOC_WORDS = 41_710
 
 

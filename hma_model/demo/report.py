@@ -72,7 +72,7 @@ def _headline(page: Page, made: DemoRun) -> None:
         gain, seconds = found["psnr_action_gain_last"], horizon(found)
         if gain is not None:
             about = f"{robot}: last-frame PSNR gain, recorded vs shuffled actions, after {seconds:.1f} s"
-            torn = [name for name, one in made.left[robot].items() if not one.whole]
+            torn = [name for name, one in made.left[robot].items() if not one.intact]
             tiles.append(
                 (
                     f"{gain:+.1f} dB",

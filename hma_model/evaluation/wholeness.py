@@ -23,6 +23,7 @@ from hma_model.network.model import HMA
 NEAR = 60.0  # distance of RGB within which a pixel has an object's colour
 FEWEST = 12  # pixels of an object below which it is hidden, and not judged
 WHOLE = (0.8, 1.2)  # shares of the true pixels between which a robot or an object is whole
+MOST = 0.75  # share of the parts that are whole from which a robot or its objects are intact
 SHAPED = 0.7  # overlap with the true shape from which it is whole
 TURNS = 36  # angles of the search for the best overlap
 
@@ -132,15 +133,17 @@ class Left:
 
     Attributes:
         share: of the true pixels; 1 keeps them, 0 has melted them.
+        whole: share of the parts that keep their pixels; a lost one and a doubled one have a mean share of 1.
         shape: overlap of each with the true one after the best shift and turn.
     """
 
     share: float
+    whole: float
     shape: float
 
     @property
-    def whole(self) -> bool:
-        return WHOLE[0] <= self.share <= WHOLE[1] and self.shape >= SHAPED
+    def intact(self) -> bool:
+        return self.whole >= MOST and self.shape >= SHAPED
 
 
 def left_at(found: Found, frame: int) -> dict[str, Left]:
@@ -153,7 +156,9 @@ def left_at(found: Found, frame: int) -> dict[str, Left]:
         seen = [(color, b) for color in colors for b in np.flatnonzero(np.isfinite(kept[color]))]
         if seen:
             shape = np.mean([best_overlap(true[one], made[one]) for one in seen])
-            left[name] = Left(float(np.mean([kept[one] for one in seen])), float(shape))
+            own_shares = np.array([kept[one] for one in seen])
+            whole = (own_shares >= WHOLE[0]) & (own_shares <= WHOLE[1])
+            left[name] = Left(float(own_shares.mean()), float(whole.mean()), float(shape))
     return left
 
 
@@ -161,7 +166,10 @@ def left_words(left: dict[str, Left]) -> str:
     """Return what is left in words, and what does not stay whole."""
     if not left:
         return "nothing was large enough to judge"
-    told = [f"{one.share:.0%} of {name} left (shape overlap {one.shape:.0%})" for name, one in left.items()]
-    torn = [name for name, one in left.items() if not one.whole]
+    told = [
+        f"{one.share:.0%} of {name} left ({one.whole:.0%} whole, shape overlap {one.shape:.0%})"
+        for name, one in left.items()
+    ]
+    torn = [name for name, one in left.items() if not one.intact]
     verdict = f"damaged: {' and '.join(torn)}" if torn else "intact"
     return f"{', '.join(told)}; {verdict}"

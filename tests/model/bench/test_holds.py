@@ -1,5 +1,7 @@
 """What `hma bench holds` says of objects that stay, turn, melt, or lie elsewhere."""
 
+from dataclasses import replace
+
 import h5py
 import numpy as np
 import pytest
@@ -63,13 +65,23 @@ def test_an_object_that_is_turned_keeps_its_shape_and_one_that_lost_a_limb_does_
 
 def test_what_is_left_is_said_with_whether_it_stays_whole() -> None:
     whole = left_at(found(scene(PLACES), PLACES), FRAMES - 1)
-    assert whole == {"the robot": Left(1.0, 1.0), "loose objects": Left(1.0, 1.0)}
-    assert left_words(whole).endswith("100% of loose objects left (shape overlap 100%); intact")
+    assert whole == {"the robot": Left(1.0, 1.0, 1.0), "loose objects": Left(1.0, 1.0, 1.0)}
+    assert left_words(whole).endswith("100% of loose objects left (100% whole, shape overlap 100%); intact")
     torn = left_at(found(scene(PLACES, bar=False), PLACES), FRAMES - 1)
-    assert torn["the robot"].whole and not torn["loose objects"].whole
+    assert torn["the robot"].intact and not torn["loose objects"].intact
     assert left_words(torn).endswith("damaged: loose objects")
     many = left_at(found(np.roll(scene(PLACES), 1, axis=-1), PLACES), FRAMES - 1)  # other colours
-    assert many["the robot"] == Left(0.0, 0.0)
+    assert many["the robot"] == Left(0.0, 0.0, 0.0)
+
+
+def test_an_object_that_is_lost_and_one_that_is_doubled_are_not_whole_though_their_mean_is() -> None:
+    lost, doubled = scene(PLACES), scene(PLACES)
+    lost[..., :40, :40, :] = GREY
+    doubled[:, -1, :16, 40:56] = doubled[:, -1, 20:36, 25:41]
+    one = found(scene(PLACES), PLACES)
+    two = {name: np.concatenate([getattr(one, name)] * 2) for name in ("true", "parts")}
+    loose = left_at(replace(one, made=np.concatenate([lost, doubled]), **two), FRAMES - 1)["loose objects"]
+    assert (loose.share, loose.whole) == (1, 0) and not loose.intact
 
 
 def test_two_places_of_one_object_are_one_object_though_one_lies_on_its_edge() -> None:

@@ -85,8 +85,8 @@ def test_the_report_opens_with_decibels_and_time_under_the_rule_of_evaluate(tmp_
         figures={"arm3_55": FOUND, "mover_52": wide},
         films={name: film() for name in ("arm3_55", "mover_52")},
         left={
-            "arm3_55": {"the robot": Left(0.65, 0.48), "loose objects": Left(0.9, 0.76)},
-            "mover_52": {"the robot": Left(1.0, 0.9)},
+            "arm3_55": {"the robot": Left(0.65, 0.5, 0.48), "loose objects": Left(0.9, 0.8, 0.76)},
+            "mover_52": {"the robot": Left(1.0, 1.0, 0.9)},
         },
         run=SimpleNamespace(seconds=158.0, step=620),
         seconds={"all": 200.0},
@@ -97,7 +97,7 @@ def test_the_report_opens_with_decibels_and_time_under_the_rule_of_evaluate(tmp_
     assert "<b>+2.1 dB</b>" in shown and "after 0.6 s" in shown and "2 min 38 s" in shown
     assert "nats" not in shown
     assert shown.count("; damaged after 20 frames: the robot<") == 1  # a gain does not stand bare
-    assert "65% of the robot left (shape overlap 48%)" in shown and "90%); intact." in shown
+    assert "65% of the robot left (50% whole, shape overlap 48%)" in shown and "90%); intact." in shown
     for found in (FOUND, wide):
         assert f"The model {verdict(found)}." in shown
     assert "recorded vs shuffled actions, 0.6 s after the prompt" in shown and "may follow" in shown
