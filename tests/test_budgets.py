@@ -41,11 +41,11 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/policies": (2_770, 19_730, 14),
     "hma_model/released": (822, 7_096, 4),
     "hma_model/synthetic": (1_188, 8_996, 5),
-    "hma_model/training": (3_690, 30_256, 20),
+    "hma_model/training": (3_699, 30_296, 20),
     "hma_model/worlds": (1_524, 11_736, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_663, 520_797
-TEST_LINES = 48_405
+PRODUCT_LINES, PRODUCT_NODES = 65_672, 520_837
+TEST_LINES = 48_417
 DOC_WORDS = 41_710
 
 

@@ -1,7 +1,11 @@
 """Cut windows to a square of each frame in which something moves, so that training computes little else.
 
-The convolutional trunk looks at the surroundings of a place, so a part of a frame teaches it what the whole
-frame would, in a fraction of the time. Places near a cut edge lack their surroundings and have no loss.
+The convolutional trunk looks at the surroundings of a place, so a part of a frame teaches it most of what the
+whole frame would, in a fraction of the time. Places near a cut edge lack their surroundings and have no loss.
+
+Not all of it: the coarsest resolution sees an edge from every place of a square, and little of one in a whole
+frame. Parts of a robot that cross the frame then dissolve at the first step of a rollout, while the loss on
+squares is low. So a run ends with whole frames (`Recipe.whole_from`).
 
 B batch, T frames, V views, h,w grid of tokens of a view, C side of the square in tokens, S = C².
 """

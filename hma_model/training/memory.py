@@ -81,7 +81,9 @@ def _unet_bytes(config: HMAConfig, recipe: Recipe, predicted: int, scores: int) 
 
     A block keeps the same number of values for each of its result; most lie at the finest resolution.
     """
-    places = config.crop**2 or config.tokens_per_frame // config.views
+    places = config.tokens_per_frame // config.views
+    if config.crop and recipe.whole_from == 1:
+        places = config.crop**2
     sizes = [channels * places / 4**level for level, channels in enumerate(config.levels)]
     down_and_up = sum(sizes) + sum(sizes[:-1])
     blocks = UNET_VALUES * config.layers * down_and_up

@@ -160,6 +160,9 @@ class Recipe(_Settings):
     self_forward: Share = Field(0.0, description="share of windows with a self-predicted past")
     self_forward_frames: Count = Field(2, ge=1, description="self-predicted frames in a row; U-Net: at least")
     self_forward_from: Steps = Field(0, description="first step with such windows, counted from 0")
+    whole_from: Share = Field(
+        1.0, description="with model.crop: share of the run after which frames are whole"
+    )
 
     seed: Count = Field(42, ge=0, lt=2**63)
     precision: Literal["auto", "fp32", "bf16"] = Field(

@@ -310,8 +310,8 @@ class Run:
         return torch.Generator().manual_seed(seed_for(self.recipe.seed, what, self.step, number))
 
     def _cropped(self, number: int, batch: Batch) -> Batch:
-        """Return the batch, cut to squares if the model is trained on parts of frames."""
-        if not self.model.config.crop:
+        """Return the batch, cut to squares if the model is still trained on parts of frames."""
+        if not self.model.config.crop or self.done >= self.recipe.whole_from:
             return batch
         return cropped(self.model.config, batch, self._generator("crops", number))
 

@@ -40,9 +40,7 @@ def main() -> None:
             stats={one: dict(source.stats(one)) for one in robots},
             cards={one: source.card(one) for one in robots},
             samples={
-                one: source.path(one, SAMPLE).read_bytes()
-                for one in robots
-                if SAMPLE in source.pictures(one)
+                one: source.path(one, SAMPLE).read_bytes() for one in robots if SAMPLE in source.pictures(one)
             },
             half=True,
         )

@@ -157,6 +157,18 @@ def test_a_run_on_squares_goes_on_with_the_same_bits_and_is_tuned_on_whole_frame
     assert Checkpoint.open(tuned.checkpoint).config.crop == 0
 
 
+def test_a_run_on_squares_ends_with_whole_frames(moving, tmp_path, monkeypatch) -> None:
+    seen, plain = [], HMA.forward
+    monkeypatch.setattr(
+        HMA,
+        "forward",
+        lambda model, batch, *a, **k: seen.append(batch.places is None) or plain(model, batch, *a, **k),
+    )
+    train(of_squares(moving, steps=4, whole_from=0.5, eval_every=0), out=tmp_path / "run", show=False)
+    trained = [whole for whole in seen if whole is not None][:8]
+    assert trained == [False] * 4 + [True] * 4  # two passes a step
+
+
 @pytest.mark.slow
 def test_two_ranks_on_squares_give_the_curve_and_the_weights_of_one(moving, tmp_path):
     alone = train(of_squares(moving), out=tmp_path / "alone", show=False)
