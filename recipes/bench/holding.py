@@ -1,11 +1,9 @@
 """Measure how long the robots of a checkpoint stay with the truth, as `hma play` sees it.
 
     python recipes/bench/holding.py embedded-lab          # into hma_model/play/holding.json
-    python recipes/bench/holding.py embedded-arms --shards SHARDS --shards SHARDS
 
-Each robot replays its recorder's actions in the model until model and truth have parted
-(`hma_model.play.session`), in several scenes: of its simulator, or of the shards of one that has none here.
-The lower median over scenes is the time that it holds.
+Each robot with a simulator replays the recorder's actions in the model until model and truth have parted
+(`hma_model.play.session`), in several scenes. The lower median over scenes is the time that it holds.
 """
 
 import argparse
@@ -14,7 +12,6 @@ import statistics
 from pathlib import Path
 
 import hma_model.play
-from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import write_atomic
 from hma_model.checkpoint.folder import BUNDLED, Checkpoint
 from hma_model.play.holding import MEASURED
@@ -29,35 +26,32 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(hma_model.play.__file__).parent / MEASURED)
     parser.add_argument("--scenes", type=int, default=4)
     parser.add_argument("--frames", type=int, default=300)
-    parser.add_argument("--shards", type=Path, action="append", default=[])
     parser.add_argument("--device", default="cpu")
     given = parser.parse_args()
     checkpoint = Checkpoint.open(given.checkpoint)
     world = load_world(given.checkpoint, device=given.device)
-    robots = {
-        robot.embodiment.id: robot
-        for robot in drivable(checkpoint, map(ShardSet, given.shards), lambda: world.tokenizer).values()
-        if robot.source != "images"
-    }
-    sessions = {
-        name: [Session(robot.key, robot, n, world, world.decoding, 0.0) for n in range(given.scenes)]
-        for name, robot in robots.items()
-    }
+    robots = drivable(checkpoint, (), lambda: world.tokenizer)
+    sessions: dict[str, list[Session]] = {}
+    for name, robot in robots.items():
+        if robot.source == "simulator":
+            sessions[name] = [
+                Session(name, robot, n, world, world.decoding, 0.0) for n in range(given.scenes)
+            ]
     every = [session for some in sessions.values() for session in some]
     for session in every:
         session.replays = True
     for frame in range(given.frames):
         live = [session for session in every if session.parted is None]
-        chunks = {one: chunk for one in live if (chunk := one.next_chunk()) is not None}
-        images = world.step({session.row: chunk for session, chunk in chunks.items()}) if chunks else {}
-        for session in chunks:
+        chunks = {session.row: session.next_chunk() for session in live}
+        images = world.step({row: chunk for row, chunk in chunks.items() if chunk is not None})
+        for session in live:
             session.take(images[session.row], 0.0, 0.0)
-        print(f"frame {frame + 1}: {len(chunks)} sessions", flush=True)
+        print(f"frame {frame + 1}: {len(live)} sessions", flush=True)
     found = {}
     for name, some in sessions.items():
         hz = robots[name].embodiment.effective_hz
-        lasted = [(session.parted or session.count, session.parted is None) for session in some]
-        frames, at_least = statistics.median_low(lasted)
+        frames = statistics.median_low(session.parted or given.frames for session in some)
+        at_least = frames >= given.frames
         found[name] = {"seconds": round(frames / hz, 1), "at_least": at_least}
     bundled = {Checkpoint.open(part).trunk_sha256 for part in BUNDLED.values()}
     before = json.loads(given.out.read_text()) if given.out.exists() else {}

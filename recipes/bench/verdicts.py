@@ -1,11 +1,9 @@
 """Judge each robot of a bundled model on new recordings, and write the verdicts into its cards.
 
     python recipes/bench/verdicts.py embedded-lab  # what is finished in --work is kept
-    python recipes/bench/verdicts.py embedded-arms --shards OUT/shards
 
 The laboratory records 40 episodes of each robot with another seed than those of the training. Those that the
-recording holds out, at most eight, are judged as `hma evaluate --windows 8` does. With --shards, the held-out
-episodes of the set FOLDER/ROBOT are judged.
+recording holds out, at most eight, are judged as `hma evaluate --windows 8` does.
 """
 
 import argparse
@@ -29,7 +27,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("checkpoint", choices=BUNDLED)
     parser.add_argument("--work", type=Path, default=Path("verdicts"))
-    parser.add_argument("--shards", type=Path, metavar="FOLDER")
     given = parser.parse_args()
     work, bundled = given.work / given.checkpoint, Checkpoint.open(given.checkpoint)
     copy, tokenizer = work / "model", reopened(bundled.config.tokenizer)
@@ -37,9 +34,9 @@ def main() -> None:
         shutil.copytree(bundled.folder, copy)
     for name in bundled.embodiments:
         card = Checkpoint.open(copy).card(name)
-        if given.shards or "evaluation" not in card or not (work / name).is_dir():
+        if "evaluation" not in card or not (work / name).is_dir():
             shutil.rmtree(work / name, ignore_errors=True)
-            shards = given.shards / name if given.shards else judged(name, copy, work / name, tokenizer)
+            shards = judged(name, copy, work / name, tokenizer)
             evaluate_all(
                 [copy], [shards], EvaluationSettings("val", WINDOWS)
             )  # writes the verdict into the copy's card

@@ -1,10 +1,8 @@
 """Film a robot that is driven in `hma play`: the world model and the true simulator under the same actions.
 
-    python recipes/world/film.py arm2_07 --scene 1 --out arm.webp
-    python recipes/world/film.py fetch --shards SHARDS --scene 1 --out docs/drive.webp    # held-out episode 1
+    python recipes/world/film.py arm2_07 --scene 1 --out docs/drive.webp    # the film of the README
 
-The simulator's own driver acts; with shards, the recorded actions do. The film begins with the last frame of
-the prompt.
+The simulator's own driver acts. The film begins with the last frame of the prompt.
 """
 
 import argparse
@@ -13,7 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from hma_data.episodes.sheets import webp_bytes
-from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import write_atomic
 from hma_model.checkpoint.folder import EMBEDDED_NAME, Checkpoint
 from hma_model.play.save import panels
@@ -29,14 +26,12 @@ def main() -> None:
     parser.add_argument("robot")
     parser.add_argument("--checkpoint", default=EMBEDDED_NAME)
     parser.add_argument("--scene", type=int, default=0)
-    parser.add_argument("--shards", type=Path, action="append", default=[])
     parser.add_argument("--seconds", type=float, default=6.0)
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
     world = load_world(given.checkpoint, [given.robot])
     checkpoint = Checkpoint.open(given.checkpoint, [given.robot])
-    robots = drivable(checkpoint, map(ShardSet, given.shards), lambda: world.tokenizer)
-    robot = next(one for one in robots.values() if one.embodiment.id == given.robot)
+    robot = drivable(checkpoint, (), lambda: world.tokenizer)[given.robot]
     session = Session(given.robot, robot, given.scene, world, world.decoding, 0.0)
     session.replays = True
     hz = robot.embodiment.effective_hz
