@@ -28,7 +28,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/tokenizers": (3_512, 25_984, 18),
     "hma_model": (537, 3_349, 4),
     "hma_model/benchmark": (832, 7_108, 5),
-    "hma_model/checkpoint": (936, 7_099, 5),
+    "hma_model/checkpoint": (936, 7_100, 5),
     "hma_model/cli": (1_752, 11_257, 12),
     "hma_model/demo": (477, 4_030, 4),
     "hma_model/evaluation": (4_430, 34_999, 24),
@@ -44,9 +44,9 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_699, 30_296, 20),
     "hma_model/worlds": (1_524, 11_736, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_672, 520_837
-TEST_LINES = 48_417
-DOC_WORDS = 41_710
+PRODUCT_LINES, PRODUCT_NODES = 65_672, 520_838
+TEST_LINES = 48_418
+DOC_WORDS = 41_990
 
 
 @cache

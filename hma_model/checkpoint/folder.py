@@ -41,7 +41,7 @@ PICTURES = (SAMPLE, FILM)  # optional, shown in the model card
 EMBEDDED_NAME = "embedded"
 BUNDLED = {  # the later, the better with a robot that several have
     name: Path(__file__).parents[1] / name
-    for name in ("embedded-fsq", "embedded-lab", "embedded-lab2", "embedded-pusht")
+    for name in ("embedded-fsq", "embedded-lab", "embedded-lab2", "embedded-lab3", "embedded-pusht")
 }
 _OTHER_TRUNK = "pull the embodiment and its trunk together, or finetune it on this trunk"
 _CUT_SHORT = "a push or pull was interrupted: run it again"

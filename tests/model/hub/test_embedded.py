@@ -80,6 +80,7 @@ def test_every_bundled_checkpoint_is_whole_and_small(name) -> None:
         (["arm2_02", "planar_arm"], "fsq-lab", "embedded-fsq"),
         (["arm2_02", "planar_arm"], "vae-8", "embedded-lab"),
         (["rails_03"], "palette-64", "embedded-lab2"),
+        (["rails_09", "arm1_03"], None, "embedded-lab3"),
         (["arm2_02", "rails_03"], None, "embedded-fsq"),
         (["pusht_fast"], None, "embedded-pusht"),
         (["pusht_fast"], "fsq-lab", "embedded-pusht"),
