@@ -168,15 +168,12 @@ class RemotePath(PosixPath):
 
         return attempt(self, "read", ask)
 
-    def listing(self, depth: int | None = None) -> dict[str, int]:
-        """Return name below this folder -> bytes of every file, sorted by name; empty where there is none.
-
-        `depth` is how many levels below it are listed; None for all.
-        """
+    def listing(self) -> dict[str, int]:
+        """Return name below this folder -> bytes of every file, sorted by name; empty where there is none."""
 
         def ask() -> dict[str, Any]:
             self._forget()
-            return dict(self.files.find(self.key, maxdepth=depth, detail=True))
+            return dict(self.files.find(self.key, detail=True))  # not to a depth: that leaves out what fails
 
         try:
             found = attempt(self, "listed", ask)
@@ -228,7 +225,7 @@ class RemotePath(PosixPath):
     def glob(self, pattern: str, **_: Any) -> Generator["RemotePath"]:
         """Yield the files below whose path matches the pattern, part by part; folders are not listed."""
         wanted = pattern.split("/")
-        for name in self.listing(len(wanted)):
+        for name in self.listing():
             parts = name.split("/")
             if len(parts) == len(wanted) and all(map(fnmatchcase, parts, wanted)):
                 yield self / name

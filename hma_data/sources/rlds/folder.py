@@ -278,7 +278,7 @@ def _open(uri: str, root: Path, only: Path | None, changed: tuple[int, ...]) -> 
 def _files_in(root: Path) -> list[Path]:
     """Return the files of a folder and of those directly below it, sorted."""
     if isinstance(root, RemotePath):
-        return [root / name for name in root.listing(2)]
+        return [root / name for name in root.listing() if name.count("/") < 2]
     with explained(root):
         return sorted(path for pattern in ("*", "*/*") for path in root.glob(pattern) if path.is_file())
 
