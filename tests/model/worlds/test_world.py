@@ -196,7 +196,7 @@ def test_a_robot_with_a_bundled_checkpoint_to_itself_is_found_by_the_name_embedd
     assert actions.seen is not None and (actions.seen[0] >= 15).all() and (actions.seen[1] <= 497).all()
     assert world.one_pass and world.decoding.temperature == 0
     with pytest.raises(
-        HMAError, match="embedded: pusht_fast is in embedded-pusht and gantry_04 is in embedded-fsq: no"
+        HMAError, match="embedded: pusht_fast is in embedded-pusht and gantry_04 is in embedded-lab3: no"
     ):
         load_world("embedded", ["pusht_fast", ARM])
     with pytest.raises(HMAError, match=r"embedded-fsq: '\.\.' is not an embodiment's id"):
