@@ -173,7 +173,7 @@ class RemotePath(PosixPath):
 
         def ask() -> dict[str, Any]:
             self._forget()
-            return dict(self.files.find(self.key, detail=True))  # not to a depth: that leaves out what fails
+            return dict(self.files.find(self.key, detail=True))  # with maxdepth it would leave out what fails
 
         try:
             found = attempt(self, "listed", ask)
@@ -204,31 +204,37 @@ class RemotePath(PosixPath):
         mode = stat.S_IFREG if found["type"] == "file" else stat.S_IFDIR
         return os.stat_result((mode | 0o644, 0, 0, 0, 0, 0, int(found["size"] or 0), 0, 0, 0))
 
+    def _entries(self) -> list[tuple[str, bool]]:
+        """Return the names directly below, sorted, and whether each is a folder; empty where nothing is."""
+
+        def ask() -> list[tuple[str, bool]]:
+            self._forget()
+            found = self.files.ls(self.key, detail=True)
+            return [(str(item["name"]).rstrip("/"), item["type"] == "directory") for item in found]
+
+        try:
+            entries = attempt(self, "listed", ask)
+        except FileNotFoundError:
+            return []
+        return [(name.rsplit("/", 1)[-1], folder) for name, folder in sorted(entries) if name != self.key]
+
     def iterdir(self) -> Generator["RemotePath"]:
         """Yield the files and folders directly below.
 
         A folder that does not exist yields nothing, because stores keep no empty folders.
         """
-
-        def ask() -> list[str]:
-            self._forget()
-            return [str(item["name"]) for item in self.files.ls(self.key, detail=True)]
-
-        try:
-            names = attempt(self, "listed", ask)
-        except FileNotFoundError:
-            return
-        for name in sorted(item.rstrip("/") for item in names):
-            if name != self.key:
-                yield self / name.rsplit("/", 1)[-1]
+        for name, _ in self._entries():
+            yield self / name
 
     def glob(self, pattern: str, **_: Any) -> Generator["RemotePath"]:
-        """Yield the files below whose path matches the pattern, part by part; folders are not listed."""
-        wanted = pattern.split("/")
-        for name in self.listing():
-            parts = name.split("/")
-            if len(parts) == len(wanted) and all(map(fnmatchcase, parts, wanted)):
-                yield self / name
+        """Yield the files below whose path matches the pattern, part by part; folders are not yielded.
+
+        Only folders that match are listed, each by a request: fsspec's own walk leaves out what fails.
+        """
+        first, _, rest = pattern.partition("/")
+        for name, folder in self._entries():
+            if fnmatchcase(name, first) and folder == bool(rest):
+                yield from (self / name).glob(rest) if rest else [self / name]
 
     def rglob(self, pattern: str, **_: Any) -> Generator["RemotePath"]:
         """Yield the files at any depth below whose name matches."""

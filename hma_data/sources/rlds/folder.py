@@ -277,10 +277,9 @@ def _open(uri: str, root: Path, only: Path | None, changed: tuple[int, ...]) -> 
 
 def _files_in(root: Path) -> list[Path]:
     """Return the files of a folder and of those directly below it, sorted."""
-    if isinstance(root, RemotePath):
-        return [root / name for name in root.listing() if name.count("/") < 2]
+    found = (path for pattern in ("*", "*/*") for path in root.glob(pattern))
     with explained(root):
-        return sorted(path for pattern in ("*", "*/*") for path in root.glob(pattern) if path.is_file())
+        return sorted(path for path in found if is_remote(root) or path.is_file())
 
 
 def _description(path: Path) -> bytes | None:

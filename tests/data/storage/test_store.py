@@ -117,6 +117,22 @@ def test_reading_is_tried_again_and_ends_in_one_error(bucket, monkeypatch) -> No
         (bucket / "x").read_bytes()
 
 
+def test_a_listing_that_fails_is_asked_for_again_and_never_short(bucket, monkeypatch) -> None:
+    folder, plain, failures = bucket / "some" / "set", MemoryFileSystem.ls, [ConnectionResetError("cut")] * 2
+    put_bytes(b"a", folder / "train" / "a.bin")
+
+    def stumbling(files, path, detail=True, **options):
+        if failures and path.endswith("train"):
+            raise failures.pop()
+        return plain(files, path, detail=detail, **options)
+
+    monkeypatch.setattr(MemoryFileSystem, "ls", stumbling)
+    assert list(folder.glob("*/*.bin")) == [folder / "train" / "a.bin"] and not failures
+    failures += [PermissionError("no")]
+    with pytest.raises(StorageError, match="cannot be listed: .*no"):
+        list(folder.glob("*/*.bin"))
+
+
 @pytest.mark.parametrize("cache", [True, False])
 def test_a_read_of_one_shard_looks_at_no_other(both: tuple[Path, RemotePath], cache: bool) -> None:
     looks = []
