@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
     "hma_data": (701, 3_999, 7),
     "hma_data/cli": (1_549, 11_092, 8),
-    "hma_data/conversion": (4_216, 31_495, 15),
+    "hma_data/conversion": (4_215, 31_470, 15),
     "hma_data/episodes": (1_695, 14_878, 9),
     "hma_data/hub": (517, 3_861, 3),
     "hma_data/inspection": (2_151, 20_103, 8),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_699, 30_296, 20),
     "hma_model/worlds": (1_524, 11_736, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_674, 520_886
-TEST_LINES = 48_434
+PRODUCT_LINES, PRODUCT_NODES = 65_673, 520_861
+TEST_LINES = 48_431
 DOC_WORDS = 41_990
 
 

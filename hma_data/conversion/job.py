@@ -55,14 +55,14 @@ from hma_data.sources.detect import of_another_format, require_utf8
 from hma_data.sources.lerobot.writer import origin_of
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_text
-from hma_data.storage.records import Records
+from hma_data.storage.records import Records, with_columns
 from hma_data.storage.remote import place
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_tokenizer
 from hma_data.tokenizers.shapes import get_spec
 
 MERGE = "convert some episodes (--only) into a dataset of their own; lerobot-edit-dataset merges datasets"
 BOTH_ANEW = "choose another --out and another --lerobot, or --overwrite to start both over"
-MAX_FRAMES = 1_000_000_000  # of an episode
+MAX_FRAMES = 1_000_000_000  # of an episode; damage that states more is found when it is read
 OnProgress = Callable[[Progress], None]
 
 
@@ -144,7 +144,7 @@ class Conversion(Options):
             raise
         except SourceError as fault:
             raise of_another_format(uri, form, fault) from fault
-        chosen = refs = _records(refs, uri)
+        chosen = refs = _records(refs)
         if robot.source.only or robot.source.exclude or settings.only or settings.exclude:
             ids = ids_for_robot(refs.column("id").to_pylist(), robot)
             kept = pa.array(chosen_ids(ids, settings.only, settings.exclude), pa.string())
@@ -217,13 +217,12 @@ class Conversion(Options):
         return UnfinishedShare(run.out, run.kept, run.made, missing, time.monotonic() - run.begun)
 
 
-def _records(refs: Sequence[EpisodeRef], uri: str) -> Records[EpisodeRef]:
-    """Return the episodes as records; raise SourceError where damage claims more frames than can be."""
-    frames = refs.column("frames").to_pylist() if isinstance(refs, Records) else [ref.frames for ref in refs]
-    if frames and max(frames) > MAX_FRAMES:
-        name = refs[frames.index(max(frames))].id
-        raise SourceError(uri, f"states {max(frames):,} frames for episode {name}", "it may be damaged")
-    return Records.of(EpisodeRef, refs)
+def _records(refs: Sequence[EpisodeRef]) -> Records[EpisodeRef]:
+    """Return the episodes as records. One that is damaged may state more frames than the plan can count."""
+    if not isinstance(refs, Records):
+        refs = Records.of(EpisodeRef, [replace(ref, frames=min(ref.frames, MAX_FRAMES)) for ref in refs])
+    frames = pc.min_element_wise(refs.column("frames"), MAX_FRAMES)
+    return Records(EpisodeRef, with_columns(refs.table, frames=frames))
 
 
 @contextmanager

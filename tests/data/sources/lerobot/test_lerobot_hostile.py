@@ -59,6 +59,7 @@ ONE: dict[str, Row] = {  # one episode is refused
     "no rows": (of(ROWS, Path.unlink), r"episode_000000\.parquet"),
     "rows cut short": (of(ROWS, cut(500)), r"episode_000000\.parquet: .*copy it again"),
     "a row less": (of(ROWS, a_row_less), "has 11 rows of episode_000000, its metadata says 12"),
+    "more rows than can be": (of(LISTED, swap('"length": 12', f'"length": {2**63}')), "its metadata says 9"),
     "too many rows": (of(ROWS, many_rows), "'episode_index' claims 1,001 values of 1,001 rows"),
     "a list too short": (column("action", [PAIR] * 11 + [[1.0]]), "holds lists of"),
     "a row without action": (column("action", [PAIR] * 11 + [None]), "1 missing values"),
@@ -86,10 +87,6 @@ ALL: dict[str, Row] = {  # no episode can be used
     "deep brackets": (of(INFO, whole("[" * 100_000)), r"info\.json.*Invalid JSON"),
     "a line cut short": (of(LISTED, whole(FIRST + '{"epi')), r"episodes\.jsonl line 2: is not JSON"),
     "lines nested too deeply": (of(LISTED, whole("[" * 100_000)), r"episodes\.jsonl line 1: is not JSON"),
-    "more rows than can be": (
-        of(LISTED, swap('"length": 12', f'"length": {2**63}')),
-        "states 9,223,372,036,854,775,808 frames",
-    ),
     "episode -1": (of(LISTED, whole(FIRST.replace("0", "-1"))), "whole number from 0, is -1"),
     "an episode twice": (of(LISTED, whole(FIRST * 2)), "lists episode 0 a second time"),
     "no episodes": (of(LISTED, cut(0)), "has no episodes"),
