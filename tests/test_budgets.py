@@ -24,7 +24,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/registry": (1_287, 8_311, 6),
     "hma_data/shards": (2_551, 19_631, 11),
     "hma_data/sources": (12_647, 105_357, 50),
-    "hma_data/storage": (1_652, 10_865, 11),
+    "hma_data/storage": (1_652, 10_868, 11),
     "hma_data/tokenizers": (3_512, 25_984, 18),
     "hma_model": (537, 3_349, 4),
     "hma_model/benchmark": (832, 7_108, 5),
@@ -44,7 +44,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_699, 30_296, 20),
     "hma_model/worlds": (1_524, 11_736, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_673, 520_861
+PRODUCT_LINES, PRODUCT_NODES = 65_673, 520_864
 TEST_LINES = 48_431
 DOC_WORDS = 41_990
 

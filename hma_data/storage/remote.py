@@ -231,10 +231,10 @@ class RemotePath(PosixPath):
 
         Only folders that match are listed, each by a request: fsspec's own walk leaves out what fails.
         """
-        first, _, rest = pattern.partition("/")
+        first, *rest = pattern.split("/", 1)
         for name, folder in self._entries():
             if fnmatchcase(name, first) and folder == bool(rest):
-                yield from (self / name).glob(rest) if rest else [self / name]
+                yield from (self / name).glob(*rest) if rest else [self / name]
 
     def rglob(self, pattern: str, **_: Any) -> Generator["RemotePath"]:
         """Yield the files at any depth below whose name matches."""
