@@ -221,7 +221,7 @@ def _cpu_s(pids: list[int]) -> float:
 
 
 BENCH = Bench(
-    "hma convert over many short episodes: overhead beside the tokenizer, memory of its workers over time",
+    "hma convert on many short episodes: time apart from the tokenizer's, memory of the workers over time",
     {
         "episodes": 10_000,
         "frames": 8,  # an episode

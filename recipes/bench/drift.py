@@ -328,7 +328,7 @@ def wholeness(probe: "Probe", pictures: Any, true: Any) -> Any:
 
 
 BENCH = Bench(
-    "long rollouts: how far the robot is from where its commands took it, read off the picture",
+    "long rollouts: position error of the robot in the predicted images",
     {
         "checkpoint": "embedded",
         "robots": "arm2_07,mover_10,pusht_fast",

@@ -200,7 +200,7 @@ class Frames:
 
 
 GENERATE = Bench(
-    "seconds a generated frame, and how near that is to the time of its products alone",
+    "seconds per generated frame, compared with the time of its matrix products alone",
     {
         "kind": "all",  # all (a table) | discrete | continuous | both | embedded
         "rows": "all",  # of the table, e.g. embedded,discrete-16

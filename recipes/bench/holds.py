@@ -189,7 +189,7 @@ def mean_of(values: Any) -> float | None:
 
 
 BENCH = Bench(
-    "objects in closed loop: what is left of them, whether they keep their shape, how far they are off",
+    "robots and objects in closed loop: the share of their pixels left, shape, position error",
     {
         "checkpoint": "embedded",
         "robots": "pusht_fast,arm2_07,mover_10",

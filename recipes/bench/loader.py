@@ -146,7 +146,7 @@ def _speed(batches: Iterator[Any], settings: dict[str, Any]) -> dict[str, Any]:
 
 
 BENCH = Bench(
-    "windows of a shuffled mixture out of cached local shards: speed, opening, memory",
+    "windows of a shuffled mixture from cached local shards: rate, opening time, memory",
     {
         "windows": 40_000,  # measured in each run
         "frames": 1_000_000,  # of an embodiment

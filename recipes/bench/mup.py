@@ -157,7 +157,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
 
 
 BENCH = Bench(
-    "loss by learning rate and width, with muP and without: where the best rate lies",
+    "loss by learning rate and width, with and without muP",
     {
         "widths": "32,64,128",
         "rates": "0.0005,0.001,0.002,0.004,0.008,0.016,0.032",

@@ -98,7 +98,7 @@ def served(folder: Path) -> Iterator[http.server.ThreadingHTTPServer]:
 
 
 BENCH = Bench(
-    "frames a second of a page of hma export, in headless Chromium",
+    "frames per second of an hma export page in headless Chromium",
     {"export": "build/page", "robot": "rails_03", "frames": 200},
     run,
 )

@@ -164,7 +164,7 @@ def _cpu_seconds(pid: int) -> float:
 
 
 BENCH = Bench(
-    "frames a second and latency of hma play, by the number of viewers",
+    "frames per second and latency of hma play, by number of viewers",
     {
         "checkpoint": "embedded",
         "robot": "rails_03",

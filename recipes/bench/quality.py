@@ -302,7 +302,7 @@ def _tell(line: str) -> None:
 
 
 BENCH = Bench(
-    "what a small model learns in a fixed number of steps, compared with recorded bands",
+    "quality of small models after a fixed number of steps, compared with recorded ranges",
     {
         "cases": "discrete",  # of discrete, continuous, finetuned, holds
         "steps": 0,  # of the training; 0: the case's own

@@ -193,7 +193,7 @@ STEPS: dict[str, Callable[[Path, dict[str, Any]], None]] = {
     "mixture": _mixture,
 }
 BENCH = Bench(
-    "shard sets of millions of made-up episodes: plan, manifest, resuming, mixture",
+    "planning, manifest, resume and mixture of shard sets with millions of synthetic episodes",
     {"episodes": 100_000, "embodiments": 40, "folder": ""},
     run,
 )

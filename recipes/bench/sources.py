@@ -327,7 +327,7 @@ CASES = {
 
 
 BENCH = Bench(
-    "recordings of every robot format to 256×256 RGB, with one process and with all cores",
+    "reading rate of every robot format as 256×256 RGB, on one core and on all",
     {
         "formats": ["all"],
         "filters": ["area"],
@@ -409,7 +409,7 @@ def _speed(read: Callable[[list[int]], int], batches: Iterable[list[int]]) -> di
 
 
 LEROBOT = Bench(
-    "a LeRobotDataset read by our source and by lerobot's own reader",
+    "reading rate of a LeRobotDataset, by hma and by lerobot's own reader",
     {"episodes": 4, "frames": 400, "height": 480, "width": 640, "seed": 0},
     run_lerobot,
 )

@@ -278,7 +278,7 @@ def _windows(model: "HMA", settings: dict[str, Any], generator: "torch.Generator
 
 
 TRAIN = Bench(
-    "seconds and memory of a training step",
+    "time and memory of a training step",
     {
         "kind": "discrete",
         **COMMON,  # precision may also be both, whose steps alternate

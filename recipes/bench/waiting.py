@@ -110,7 +110,7 @@ def _spin() -> None:
 
 
 WAITING = Bench(
-    "frames and training steps a second of the embedded model, by how threads wait for one another",
+    "rate of the bundled model's frames and training steps, by how threads wait for each other",
     {
         "beside": None,  # processes that keep a core busy; None: 0,1,2
         "threads": None,  # None: 1,2
