@@ -40,8 +40,8 @@ SAMPLE, FILM = "sample.png", "sample.gif"
 PICTURES = (SAMPLE, FILM)  # optional, shown in the model card
 EMBEDDED_NAME = "embedded"
 BUNDLED = {  # the later, the better with a robot that several have
-    name: Path(__file__).parents[1] / name
-    for name in ("embedded-fsq", "embedded-lab", "embedded-lab2", "embedded-lab3", "embedded-pusht")
+    f"embedded-{part}": Path(__file__).parents[1] / f"embedded-{part}"
+    for part in ("fsq", "lab", "lab2", "lab3", "fetch", "pusht")
 }
 _OTHER_TRUNK = "pull the embodiment and its trunk together, or finetune it on this trunk"
 _CUT_SHORT = "a push or pull was interrupted: run it again"

@@ -1,8 +1,10 @@
-"""Film a robot that is driven in `hma play`: the world model and the true simulator under the same actions.
+"""Film a robot that is driven in `hma play`: the world model and the truth under the same actions.
 
-    python recipes/world/film.py arm2_07 --scene 1 --out docs/drive.webp    # the film of the README
+    python recipes/world/film.py arm2_07 --scenes 1 --out film.webp
+    python recipes/world/film.py fetch --shards build/fetch/shards --scenes 0 1 2 --out docs/drive.webp
 
-The simulator's own driver acts. The film begins with the last frame of the prompt.
+The truth is the robot's simulator, driven by its own driver, or held-out recordings of --shards. Each scene
+begins with the last frame of the prompt.
 """
 
 import argparse
@@ -11,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from hma_data.episodes.sheets import webp_bytes
+from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import write_atomic
 from hma_model.checkpoint.folder import EMBEDDED_NAME, Checkpoint
 from hma_model.play.save import panels
@@ -25,24 +28,28 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("robot")
     parser.add_argument("--checkpoint", default=EMBEDDED_NAME)
-    parser.add_argument("--scene", type=int, default=0)
-    parser.add_argument("--seconds", type=float, default=6.0)
+    parser.add_argument("--shards", type=Path, help="recordings to replay; default: the robot's simulator")
+    parser.add_argument("--scenes", type=int, nargs="+", default=[0])
+    parser.add_argument("--seconds", type=float, default=6.0, help="at most, in each scene")
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
     world = load_world(given.checkpoint, [given.robot])
     checkpoint = Checkpoint.open(given.checkpoint, [given.robot])
-    robot = drivable(checkpoint, (), lambda: world.tokenizer)[given.robot]
-    session = Session(given.robot, robot, given.scene, world, world.decoding, 0.0)
-    session.replays = True
-    hz = robot.embodiment.effective_hz
-    for _ in range(round(given.seconds * hz)):
-        chunk = session.next_chunk()
-        if chunk is None:
-            break
-        session.take(world.step({session.row: chunk})[session.row], 0.0, 0.0)
-    frames = np.stack(list(panels(session.film(), SIDE, "simulator")))
-    write_atomic(given.out, webp_bytes(frames, hz))
-    scores = [frame.psnr for frame in session.frames if frame.psnr is not None]
+    sets = [ShardSet(given.shards)] if given.shards else []
+    robot = next(iter(drivable(checkpoint, sets, lambda: world.tokenizer).values()))
+    hz, label = robot.embodiment.effective_hz, "recording" if given.shards else "simulator"
+    frames, scores = [], []
+    for scene in given.scenes:
+        session = Session(given.robot, robot, scene, world, world.decoding, 0.0)
+        session.replays = True
+        for _ in range(round(given.seconds * hz)):
+            chunk = session.next_chunk()
+            if chunk is None:
+                break
+            session.take(world.step({session.row: chunk})[session.row], 0.0, 0.0)
+        frames += list(panels(session.film(), SIDE, label))
+        scores += [frame.psnr for frame in session.frames if frame.psnr is not None]
+    write_atomic(given.out, webp_bytes(np.stack(frames), hz))
     print(f"{given.out}: {len(frames)} frames at {hz:g} Hz, mean PSNR {np.mean(scores):.1f} dB")
 
 

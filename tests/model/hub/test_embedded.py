@@ -82,6 +82,7 @@ def test_every_bundled_checkpoint_is_whole_and_small(name) -> None:
         (["rails_03"], "palette-64", "embedded-lab2"),
         (["rails_09", "arm1_03"], None, "embedded-lab3"),
         (["arm2_02", "rails_03"], None, "embedded-fsq"),
+        (["fetch"], None, "embedded-fetch"),
         (["pusht_fast"], None, "embedded-pusht"),
         (["pusht_fast"], "fsq-lab", "embedded-pusht"),
         (["nobody"], "palette-64", "embedded-fsq"),
@@ -93,7 +94,7 @@ def test_the_best_network_that_has_all_robots_is_found_by_the_name_embedded(robo
 
 def test_no_network_has_seen_the_robots_of_the_demo() -> None:
     known = {one for name in folder.BUNDLED for one in folder.Checkpoint.open(name).embodiments}
-    assert known == {*ROBOTS, "pusht_fast"} and not known & set(HELD_OUT)
+    assert known == {*ROBOTS, "fetch", "pusht_fast"} and not known & set(HELD_OUT)
 
 
 def test_the_embedded_transformer_is_the_one_of_the_recipe() -> None:
