@@ -82,6 +82,8 @@ class UnitAssignment:
             units = np.stack([groups, np.zeros_like(groups)], axis=1)
             return cls(units, np.diff(index.unit_first)[groups], np.full(len(groups), -1), 1)
         parts = -(-UNITS * readers // len(groups)) if readers > 1 and len(groups) < UNITS * readers else 1
+        while np.minimum(np.diff(index.unit_first), parts).sum() < readers:  # a few groups have most windows
+            parts *= 2
         units = np.stack([np.repeat(groups, parts), np.tile(np.arange(parts), len(groups))], axis=1)
         windows = np.diff(index.unit_first)[units[:, 0]]
         sizes = np.maximum(0, windows - units[:, 1] + parts - 1) // parts

@@ -181,7 +181,7 @@ def train(made: DemoRun, steps: int | None, seed: int) -> None:
 
     data = [str(shards.folder.absolute()) for shards in made.sets.values()]
     own = [f"seed={seed}", f"mixture.temperature={TAU}"]
-    most = load_recipe(RECIPE, [*own, f"data=[{', '.join(data)}]"]).steps
+    most = load_recipe(RECIPE).steps
     overrides = [*own, f"steps={min(most, steps or most)}"]
     result = finetune(START, data, out=made.out / "run", recipe=RECIPE, overrides=overrides)
     if result.interrupted:

@@ -163,13 +163,14 @@ class Average:
     def __init__(self, model: nn.Module, decay: float) -> None:
         self.decay = decay
         self._model = model
-        self._own = {n: p.detach().clone() for n, p in model.named_parameters() if p.requires_grad}
+        every = model.named_parameters(remove_duplicate=False)  # a shared stem under each robot's name
+        self._own = {name: p.detach().clone() for name, p in every if p.requires_grad}
 
     @torch.no_grad()
     def update(self, step: int) -> None:
         """Update the average with the weights after step `step`, counted from 1."""
         weight = 1 - min(self.decay, (1 + step) / (10 + step))
-        moving = dict(self._model.named_parameters())
+        moving = dict(self._model.named_parameters(remove_duplicate=False))
         own = [local(value) for value in self._own.values()]
         torch._foreach_lerp_(own, [local(moving[name].detach()) for name in self._own], weight)
 

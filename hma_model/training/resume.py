@@ -143,7 +143,7 @@ class TrainingState:
             model.load_embodiment(name, *self.shown[name])
         if not self.weights:
             return
-        self.averages.update({n: p.detach().cpu().clone() for n, p in model.named_parameters()})
+        self.averages.update({name: value.cpu().clone() for name, value in model.state_dict().items()})
         new = model.embodiments.keys() - self.shown.keys()
         fresh = tuple(f"{part}.{module_key(name)}." for name in new for part in ("stems", "heads"))
         own = {name: tensor for name, tensor in model.state_dict().items() if not name.startswith(fresh)}

@@ -101,6 +101,12 @@ def test_readers_get_about_the_same_number_of_windows(episodes: int, readers: in
     assert max(shares) <= 1.15 * min(shares) + 2
 
 
+def test_every_reader_gets_a_window_where_one_row_group_has_most_of_them() -> None:
+    index = WindowIndex.of(fake(([2] + [1] * 62) * 15 + [64], group=64), "train", 2)
+    deal = UnitAssignment.of(index, 32)
+    assert all(deal.of_reader(reader)[1].sum() for reader in range(32)) and deal.sizes.sum() == index.count
+
+
 def test_an_epoch_of_all_readers_is_every_window_once(decoder: RowDecoder) -> None:
     deal = UnitAssignment.of(decoder.index, 3)
     streams = [WindowSequence(decoder, deal, 5, reader, 2) for reader in range(3)]

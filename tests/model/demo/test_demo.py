@@ -17,6 +17,7 @@ from hma_model.evaluation.pages import Page
 from hma_model.evaluation.rollout_video import RolloutVideo
 from hma_model.evaluation.verdict import verdict
 from hma_model.evaluation.wholeness import Left
+from hma_model.training import loop
 
 
 @pytest.mark.slow
@@ -52,6 +53,17 @@ def test_a_demo_that_was_cut_goes_on_by_the_same_command(tmp_path, monkeypatch) 
     for title in ("The robots", "Recorded vs decoded frames", "Sizes and timings", "on your own data"):
         assert title in page
     assert "hma finetune shards/my_arm --from embedded" in page
+
+
+def test_the_demo_trains_in_a_folder_of_any_name(tmp_path, monkeypatch) -> None:
+    made = DemoRun(tmp_path, None, sets={"arm": SimpleNamespace(folder=tmp_path / "a: [1], #2")})
+    monkeypatch.setattr(
+        loop,
+        "finetune",
+        lambda _, data, **others: SimpleNamespace(data=data, interrupted=False, step=2, seconds=0.0),
+    )
+    demos.train(made, 2, 0)
+    assert made.run.data == [str(tmp_path / "a: [1], #2")]
 
 
 def test_a_folder_that_holds_something_else_is_refused(tmp_path: Path) -> None:

@@ -263,13 +263,17 @@ def keyed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., list
     return make
 
 
-def test_robots_of_one_stats_key_share_statistics_and_stem(recipe, keyed, tmp_path) -> None:
+@pytest.mark.parametrize("ema", [0.0, 0.9])
+def test_robots_of_one_stats_key_share_statistics_and_stem(recipe, keyed, tmp_path, ema) -> None:
     data = keyed(2, 2)
-    given = recipe(data=data, steps=6, checkpoint_every=2)
+    given = recipe(data=data, steps=6, checkpoint_every=2, ema=ema)
     whole = Path(train(given, out=tmp_path / "whole", show=False).checkpoint)
     folders = [whole / "embodiments" / name for name in ("arm0", "arm1")]
     stems = [load_file(folder / "stem.safetensors") for folder in folders]
     assert all(torch.equal(stems[0][name], value) for name, value in stems[1].items())
+    if ema:
+        trained = load_file(whole / "training" / "weights.safetensors")
+        assert not torch.equal(stems[0]["input.weight"], trained["stems.id_arm0.input.weight"])
     one, other = (json.loads((folder / "stats.json").read_text())["action"] for folder in folders)
     rows = np.concatenate(
         [
