@@ -157,10 +157,12 @@ class Rollout:
         return replace(self.state.snapshot(rows), passive=self.passes.passive)
 
     def restore(self, rows: Sequence[int], snapshot: Snapshot) -> None:
-        """Put rows into the state of a snapshot of as many rows, from any rollout of the same model."""
+        """Put rows into the state of a snapshot of as many rows, from any rollout of the model and `cache`."""
         chosen = self._chosen(rows)
         if len(snapshot.times) != len(chosen):
             raise HMAError("snapshot", f"has {len(snapshot.times)} rows", f"give one of {len(chosen)}")
+        if snapshot.caching != self.caching:  # frames lie elsewhere, and nothing or too little is computed
+            raise HMAError("snapshot", f"is of cache={snapshot.caching}", "restore it into such a rollout")
         if self._clashes(snapshot.passive):
             raise HMAError(
                 "snapshot", "some rows have actions and some have none", "give them always or never"

@@ -32,6 +32,7 @@ class Snapshot:
         generators: the states of the generators.
         frames, chunks, known: the rows of the buffers.
         carried: the rows of what the trunk carries; None if there is nothing yet.
+        caching: whether the rollout keeps keys and values.
         passive: whether the rollout has no actions; None if it has made no step.
     """
 
@@ -42,7 +43,8 @@ class Snapshot:
     frames: Tensor
     chunks: Tensor
     known: Tensor
-    carried: Carried | None = None
+    carried: Carried | None
+    caching: bool
     passive: bool | None = None
 
     def take(self, rows: Sequence[int]) -> "Snapshot":
@@ -270,7 +272,8 @@ class RowState:
         """Return a copy of the state of rows."""
         states = tuple(None if one is None else one.get_state() for one in self.generators)
         lists = tuple(self.embodiments), tuple(self.times), tuple(self.pending), states
-        return Snapshot(*lists, self.frames, self.chunks, self.known, self.carried).take(rows)
+        buffers = self.frames, self.chunks, self.known
+        return Snapshot(*lists, *buffers, self.carried, self.caching).take(rows)
 
     def restore(self, rows: Sequence[int], kept: Snapshot) -> None:
         """Put rows into the state of a snapshot."""

@@ -131,6 +131,8 @@ def test_a_snapshot_goes_on_in_any_row_of_any_rollout(layout: str) -> None:
     advance(rollout, sessions)
     expected = alone(model, sessions[0], {"temperature": 0.7})
     assert torch.equal(torch.stack(sessions[0].made), torch.stack(expected))
+    with pytest.raises(HMAError, match="is of cache=True"):
+        Rollout(model, "hand.v1", 1, cache=False).restore([0], kept)
 
 
 def test_a_fork_of_some_rows_copies_these_alone(monkeypatch: pytest.MonkeyPatch) -> None:

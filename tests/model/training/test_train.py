@@ -149,10 +149,11 @@ def test_a_budget_of_cpu_seconds_ends_the_run_and_bends_the_rate(recipe, tmp_pat
     clock = itertools.count()  # every step takes one second of it
     monkeypatch.setattr(time, "process_time", lambda: float(next(clock)))
     given = {"steps": 1000, "cpu_seconds": 5.0, "warmup": 0, "schedule": "cosine", "lr_end": 0.0}
-    made = recipe(**given, checkpoint_every=2, eval_every=0)
+    made = recipe(**given, checkpoint_every=2, eval_every=0, report=True)
     train_until(made, tmp_path / "run", 3)
     result = train(made, out=tmp_path / "run", show=False)
     assert (result.step, result.interrupted) == (5, False)
+    assert "5 of 1,000" not in (result.out / "report.html").read_text()
     rates = [line["lr"] for line in read_metrics(result.out) if line["kind"] == "train"]
     assert rates == pytest.approx([made.lr * 0.5 * (1 + math.cos(math.pi * k / 5)) for k in range(5)])
 
