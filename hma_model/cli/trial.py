@@ -78,8 +78,9 @@ def try_recording(
     time_limit = (f"cpu_seconds={cpu_seconds}", f"steps={UNLIMITED_STEPS}")
     again = ("--force",) if run.is_dir() else ()  # with more --minutes, a run goes on
     step("finetune", shards, "--from", BUNDLED, *time_limit, "--out", run, *again)
-    step("evaluate", run, shards, "--windows", 24, "--out", folder / "evaluation")
-    frames = ("--prompt", PROMPT, "--frames", _film_frames(shards))
+    split, most = _shown_split(shards)
+    step("evaluate", run, shards, "--split", split, "--windows", 24, "--out", folder / "evaluation")
+    frames = ("--split", split, "--prompt", PROMPT, "--frames", most)
     shown = film.is_file() and film.stat().st_mtime > (run / "checkpoints").stat().st_mtime
     step("generate", run, shards, *frames, "--unmask-steps", 8, "--out", film, there=shown)
     say(f"open {_write_page(folder, shards, film, done)}")
@@ -120,13 +121,14 @@ def _run(words: list[str]) -> None:
         raise SystemExit(code)
 
 
-def _film_frames(folder: Path) -> int:
-    """Return how many frames the longest held-out episode has to predict."""
+def _shown_split(folder: Path) -> tuple[str, int]:
+    """Return val, or train if no episode is held out, and how many frames its longest has to predict."""
     from hma_data.shards.reader import ShardSet
 
     shards = ShardSet(folder)
-    longest = int(shards.index("val").length.max(initial=0)) // shards.row_stride
-    return max(1, min(LONGEST_FILM, longest - PROMPT))
+    split = "val" if shards.manifest.splits["val"]["episodes"] else "train"
+    longest = int(shards.index(split).length.max()) // shards.row_stride
+    return split, max(1, min(LONGEST_FILM, longest - PROMPT))
 
 
 def _answer(path: Path, given: list[str]) -> None:
@@ -191,7 +193,8 @@ def _write_page(folder: Path, shards: Path, film: Path, done: list[list[str]]) -
     from hma_model.evaluation.verdict import verdict
 
     [found] = json.loads((folder / "evaluation" / "results.json").read_bytes())["results"]
-    page = Page("Your robot in the model", f"The model {verdict(found)}.")
+    seen = " No episode was held out, so it was trained on these." if found["split"] == "train" else ""
+    page = Page("Your robot in the model", f"The model {verdict(found)}.{seen}")
     video, recorded = VideoFile(film), ShardSet(shards)
     frames = video.frames(range(len(video)))
     caption = "Recorded frames, decoded from tokens; predicted from the recorded actions; from other actions."

@@ -13,6 +13,7 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.storage.yaml_io import read_yaml, write_yaml
 from hma_model.cli import trial
 from tests.command import fails, hma, hma_process
+from tests.model.shards import make_shards
 
 ANSWER = ("--answer", "action.space=joint_delta")
 
@@ -67,6 +68,22 @@ def test_a_proposed_crop_is_asked_about_in_a_terminal(said, cropped, tmp_path, m
     monkeypatch.setattr("builtins.input", lambda question: said)
     trial._answer(path, [])
     assert ("crop" in read_yaml(path)["cameras"][0]) is cropped
+
+
+def test_of_a_single_episode_the_training_is_shown(tmp_path, monkeypatch) -> None:
+    recording, out, ran = recorded(tmp_path, 1), tmp_path / "out", []
+
+    def without_training(words: list[str]) -> None:
+        ran.append(words)
+        if words[0] == "convert":
+            make_shards(out / "shards", "arm", episodes=1, held_out=0)
+        if words[0] == "finetune":
+            (out / "run" / "checkpoints").mkdir(parents=True)
+
+    monkeypatch.setattr(trial, "_run", without_training)
+    monkeypatch.setattr(trial, "_write_page", lambda *given: out)
+    assert hma("try", str(recording), "-e", "mover_52", "--out", str(out)).returncode == 0
+    assert ["train"] * 2 == [words[words.index("--split") + 1] for words in ran if "--split" in words]
 
 
 @pytest.mark.slow
