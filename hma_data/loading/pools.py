@@ -132,13 +132,13 @@ class WindowSequence:
         """Return windows start to start + count of the sequence: those of `Rows.cut`, and camera (n,)."""
         cuts = []
         while count:
-            rows = self._rows if self._begin <= start < self._end else None
-            rows = rows or self._load(start)
+            if self._rows is None or not self._begin <= start < self._end:
+                self._rows = self._load(start)
             some = min(count, self._end - start)
             chosen = slice(start - self._begin, start - self._begin + some)
             last = None if self._last is None else self._last[chosen]
             view = None if self._view is None else self._view[chosen]
-            cut = rows.cut(self._first[chosen], last, self._decoder.index, view)
+            cut = self._rows.cut(self._first[chosen], last, self._decoder.index, view)
             cut["camera"] = self._camera[chosen]
             cuts.append(cut)
             start, count = start + some, count - some
@@ -182,5 +182,4 @@ class WindowSequence:
         self._last = np.concatenate(lasts)[mixed] if index.padded_episodes else None
         draws = np.random.default_rng([*self._entropy, epoch, number, 1]).integers(0, 2**31, len(first))
         self._camera, self._view = self._decoder.views.taken(draws)
-        self._rows = Rows.join(loaded)
-        return self._rows
+        return Rows.join(loaded)

@@ -127,8 +127,8 @@ def _shown_split(folder: Path) -> tuple[str, int]:
 
     shards = ShardSet(folder)
     split = "val" if shards.manifest.splits["val"]["episodes"] else "train"
-    longest = int(shards.index(split).length.max()) // shards.row_stride
-    return split, max(1, min(LONGEST_FILM, longest - PROMPT))
+    longest = int(shards.index(split).length.max()) // shards.row_stride - PROMPT
+    return split, max(1, min(LONGEST_FILM, longest))
 
 
 def _answer(path: Path, given: list[str]) -> None:

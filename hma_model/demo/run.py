@@ -170,7 +170,7 @@ def mix(made: DemoRun) -> None:
     sets = open_sets(list(made.sets.values()))
     counts = {name: WindowIndex.of(shards, "train", frames).count for name, shards in sets.items()}
     made.mixture = Mixture.of(counts, TAU)
-    for name, count, p in zip(made.mixture.names, counts.values(), made.mixture.p, strict=True):
+    for (name, count), p in zip(counts.items(), made.mixture.p, strict=True):
         print(f"  {name}: {count:,} windows, drawn with p = {p:.3f}", flush=True)
 
 
@@ -180,10 +180,9 @@ def train(made: DemoRun, steps: int | None, seed: int) -> None:
     from hma_model.training.recipe import load_recipe
 
     data = [str(shards.folder.absolute()) for shards in made.sets.values()]
-    own = [f"seed={seed}", f"mixture.temperature={TAU}"]
     most = load_recipe(RECIPE).steps
-    overrides = [*own, f"steps={min(most, steps or most)}"]
-    result = finetune(START, data, out=made.out / "run", recipe=RECIPE, overrides=overrides)
+    own = [f"seed={seed}", f"mixture.temperature={TAU}", f"steps={min(most, steps or most)}"]
+    result = finetune(START, data, out=made.out / "run", recipe=RECIPE, overrides=own)
     if result.interrupted:
         raise KeyboardInterrupt  # the run has saved a checkpoint
     made.result = result

@@ -17,7 +17,6 @@ H,W latent grid.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -145,19 +144,15 @@ class Rollout:
             compile=self.engine.compiled is not None, precision=self.engine.precision,
             **vars(self.decoding),
         )  # fmt: skip
-        other.restore(range(len(rows)), self._copied(rows))
+        other.restore(range(len(rows)), self.state.snapshot(rows, self.passes.passive))
         return other
 
     def snapshot(self, rows: Sequence[int] | None = None) -> Snapshot:
         """Return a copy of the state of some rows, by default all."""
-        return self._copied(self._chosen(rows))
-
-    def _copied(self, rows: list[int]) -> Snapshot:
-        """Return a copy of the state of rows, of which some may be the same."""
-        return replace(self.state.snapshot(rows), passive=self.passes.passive)
+        return self.state.snapshot(self._chosen(rows), self.passes.passive)
 
     def restore(self, rows: Sequence[int], snapshot: Snapshot) -> None:
-        """Put rows into the state of a snapshot of as many rows, from any rollout of the model and `cache`."""
+        """Put rows into the state of a snapshot of as many rows, from any rollout with the same `cache`."""
         chosen = self._chosen(rows)
         if len(snapshot.times) != len(chosen):
             raise HMAError("snapshot", f"has {len(snapshot.times)} rows", f"give one of {len(chosen)}")
@@ -219,7 +214,7 @@ class Rollout:
         self._take(chosen, chunk, following, known)
         with self.engine.computing(len(chosen)):
             values = self._frame(chosen)
-        self.state.put_frame(chosen, values)
+        self.state.put_frame(chosen, values, generated=True)
         # A copy, because what is made in inference mode could not be changed in place.
         return self._show(values.clone())
 
@@ -247,7 +242,7 @@ class Rollout:
         if self.caching:
             with self.engine.computing(len(chosen)):
                 self.passes.catch_up(chosen)
-        self.state.put_seen(chosen, values)
+        self.state.put_frame(chosen, values, generated=False)
 
     @torch.no_grad()
     def act(self, rows: Sequence[int] | None = None) -> Tensor:

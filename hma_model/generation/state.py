@@ -45,7 +45,7 @@ class Snapshot:
     known: Tensor
     carried: Carried | None
     caching: bool
-    passive: bool | None = None
+    passive: bool | None
 
     def take(self, rows: Sequence[int]) -> "Snapshot":
         """Return a copy of some of the rows, in this order; a row may be taken several times."""
@@ -168,18 +168,12 @@ class RowState:
         self.chunks[index, slot, : chunk.shape[1]] = chunk
         self.known[index, slot] = True if known is None else known
 
-    def put_frame(self, rows: Sequence[int], frames: Tensor) -> None:
-        """Add the next frame (n, S) of each row."""
+    def put_frame(self, rows: Sequence[int], frames: Tensor, generated: bool) -> None:
+        """Add the next frame (n, S) of each row; generating it has computed the frames before it."""
         self.frames[self.tensor(rows), self._slot(rows)] = frames
         for row in rows:
-            self.times[row], self.pending[row] = self.times[row] + 1, 1
-
-    def put_seen(self, rows: Sequence[int], frames: Tensor) -> None:
-        """Add the next frame (n, S) of each row, which no pass has computed."""
-        pending = [self.pending[row] + 1 for row in rows]
-        self.put_frame(rows, frames)
-        for row, count in zip(rows, pending):
-            self.pending[row] = count
+            self.times[row] += 1
+            self.pending[row] = 1 if generated else self.pending[row] + 1
 
     def newest(self, rows: Sequence[int]) -> Tensor:
         """Return the newest frame (n, S) of each row."""
@@ -268,12 +262,12 @@ class RowState:
 
     # -- snapshots ----------------------------------------------------------------------------------------
 
-    def snapshot(self, rows: Sequence[int]) -> Snapshot:
-        """Return a copy of the state of rows."""
+    def snapshot(self, rows: Sequence[int], passive: bool | None) -> Snapshot:
+        """Return a copy of the state of rows, of which some may be the same."""
         states = tuple(None if one is None else one.get_state() for one in self.generators)
         lists = tuple(self.embodiments), tuple(self.times), tuple(self.pending), states
         buffers = self.frames, self.chunks, self.known
-        return Snapshot(*lists, *buffers, self.carried, self.caching).take(rows)
+        return Snapshot(*lists, *buffers, self.carried, self.caching, passive).take(rows)
 
     def restore(self, rows: Sequence[int], kept: Snapshot) -> None:
         """Put rows into the state of a snapshot."""

@@ -313,9 +313,8 @@ class RegressionReadout(nn.Module):
         nn.init.zeros_(self.proj.bias)
 
     def forward(self, features: Tensor, positions: Tensor, before: Tensor | None = None) -> Tensor:
-        """Return features (B, T, S, D), followed by the patches `before` (B, T, S, C); zeros by default."""
-        if before is None:
-            before = features.new_zeros(*features.shape[:-1], self.proj.out_features)
+        """Return features (B, T, S, D), followed by the patches `before` (B, T, S, C)."""
+        assert before is not None  # `HMAConfig` wants `copy_previous`
         return torch.cat([features.float(), before.float()], dim=-1)
 
     def loss(

@@ -79,9 +79,8 @@ class HeldOut:
             return ""
         facts = {"frames": recipe.frames, "count": recipe.pictures, "seed": recipe.seed}
         fault = write_sheets(model, self.sets, out, step, cameras=recipe.cameras, **facts)
-        is_first = len(self._sheet_seconds) == 1
         self._sheet_seconds.append(time.monotonic() - begun)
-        return fault if fault and is_first else ""
+        return fault if len(self._sheet_seconds) == 2 else ""
 
     def _batches(self) -> Iterator[Batch]:
         recipe = self._recipe

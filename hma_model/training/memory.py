@@ -90,9 +90,7 @@ def _unet_bytes(config: HMAConfig, recipe: Recipe, predicted: int, scores: int) 
     if recipe.checkpointing:  # what enters each block, and the values of the one that is recomputed
         blocks = config.layers * down_and_up + UNET_VALUES * sizes[0]
     every = any(not OBJECTIVES[name].predicts_video or OBJECTIVES[name].readout for name in recipe.objectives)
-    computed = predicted + (
-        config.frames if every else 0
-    )  # frames before the predicted ones are not computed
+    computed = predicted + every * config.frames  # those before the predicted ones only then
     embedded = 2 * config.frames * places * config.views * config.width
     share = UNET_BF16_SHARE if recipe.precision == "bf16" else 1.0
     return 4.0 * (share * computed * (blocks + embedded) + predicted * scores * places * config.views)

@@ -16,7 +16,7 @@ from torch import Tensor
 from hma_data.loading.dataset import Batch
 from hma_model.network.conditioning import Groups, align
 from hma_model.network.copying import frames_before
-from hma_model.network.head import uniform
+from hma_model.network.head import device_of, uniform
 from hma_model.network.model import HMA
 from hma_model.network.stem import from_digits, patches_before, split_tokens, unpatchify
 
@@ -40,8 +40,7 @@ def forwarded(
         The batch with `context`; the same batch if no window was drawn.
     """
     size, frames = batch.stored.shape[:2]
-    where = "cpu" if generator is None else generator.device
-    draws = uniform((2, size), generator, where)
+    draws = uniform((2, size), generator, device_of(generator))
     if frames < 3 or not bool((draws[0] < share).any()):
         return batch
     depth = min(depth, frames - 2)

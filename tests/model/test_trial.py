@@ -83,7 +83,7 @@ def test_of_a_single_episode_the_training_is_shown(tmp_path, monkeypatch) -> Non
     monkeypatch.setattr(trial, "_run", without_training)
     monkeypatch.setattr(trial, "_write_page", lambda *given: out)
     assert hma("try", str(recording), "-e", "mover_52", "--out", str(out)).returncode == 0
-    assert ["train"] * 2 == [words[words.index("--split") + 1] for words in ran if "--split" in words]
+    assert [words[words.index("--split") + 1] for words in ran if "--split" in words] == ["train"] * 2
 
 
 @pytest.mark.slow
