@@ -85,8 +85,7 @@ def play(
 
     listener = _listen(host, port)
     name = "the bundled model" if opened.bundled else checkpoint
-    if token is None and host not in LOOPBACK:
-        token = secrets.token_urlsafe(18)
+    token = token or (None if host in LOOPBACK else secrets.token_urlsafe(18))
     shown = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
     query = f"?token={quote(token, safe='')}" if token else ""
     address = f"http://{shown}:{listener.getsockname()[1]}/{query}"

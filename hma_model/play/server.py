@@ -45,6 +45,7 @@ from hma_model.worlds.world import World
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 FIRST_ROBOT = "pusht_fast"  # the robot that a page opens with: its T stays whole, and it is easy to drive
 PARTS = {"page.css": "text/css", "controls.js": "text/javascript"}  # that the page shares with exported pages
+HEADERS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
 MAX_VIEWERS = 32
 MESSAGES_PER_S, MESSAGE_BURST = 200.0, 400.0  # messages of a viewer a second, and at once
 SCENE_COST = 20.0  # messages that one counts as which begins a scene: all other sessions wait for it
@@ -80,11 +81,11 @@ class Guard:
         except ValueError:
             return "refused: the host or the origin cannot be read"
         # An address cannot be rebound; of names, only this server's own are let in.
-        own_name = name in (*LOOPBACK, self.host)
+        own_name = name in (*LOOPBACK, self.host.lower())  # `name` is in lower case
         if not own_name and self.host not in LOOPBACK:
             with contextlib.suppress(ValueError):
                 own_name = bool(ipaddress.ip_address(name))
-            own_name = own_name or name == socket.gethostname()
+            own_name = own_name or name == socket.gethostname().lower()
         if not own_name:
             return f"refused: the host {host[:80]!r} is not this server's"
         if not own:
@@ -138,12 +139,7 @@ class Server:
             f"default-src 'none'; script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'; connect-src 'self'; "
             "img-src data: blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
         )
-        headers = {
-            "Content-Security-Policy": policy,
-            "Cache-Control": "no-store",
-            "Referrer-Policy": "no-referrer",
-            "X-Content-Type-Options": "nosniff",
-        }
+        headers = HEADERS | {"Content-Security-Policy": policy, "Referrer-Policy": "no-referrer"}
         page = self._page.replace("NONCE", nonce).replace("QUERY", self._query)
         return HTMLResponse(page, headers=headers)
 
@@ -153,8 +149,7 @@ class Server:
         if name not in PARTS:
             return PlainTextResponse("there is no such file\n", 404)
         content = files("hma_model.play").joinpath(name).read_text("utf-8")
-        headers = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
-        return Response(content, media_type=PARTS[name], headers=headers)
+        return Response(content, media_type=PARTS[name], headers=HEADERS)
 
     async def save(self, request: Request) -> Response:
         """Return what was driven in a session as a file."""
@@ -175,7 +170,7 @@ class Server:
                 return PlainTextResponse(f"{fault}\n", 500)
         media, suffix = FILE_KINDS[kind]
         file = f"{session.robot.embodiment.id}-scene-{session.number}{suffix}"
-        headers = {"Content-Disposition": f'attachment; filename="{file}"', "Cache-Control": "no-store"}
+        headers = HEADERS | {"Content-Disposition": f'attachment; filename="{file}"'}
         return Response(data, media_type=media, headers=headers)
 
     async def drive(self, websocket: WebSocket) -> None:
@@ -304,16 +299,15 @@ class Connection:
             raise UsageError("messages", "are sent too fast")
 
     def leave(self) -> None:
-        """Let the session stand still."""
-        if session := self.session:
-            self.stepper.call(lambda: self.stepper.detach(session.name, self))
+        """Let the session stand still, also one that is opened just now."""
+        self.stepper.call(lambda: self.stepper.detach(self))
 
     async def _do(self, message: messages.Message) -> None:
         if isinstance(message, messages.SeenMessage):
             self._shown = max(self._shown, min(message.serial, self._sent))
             self._heard = time.monotonic()
             self._wake.set()
-            self.stepper.wake()
+            self.stepper.call(lambda: None)  # it looks for sessions that are due
         elif isinstance(message, messages.OpenMessage | messages.ResumeMessage):
             await self._enter(message)
         elif self.session is None:
@@ -326,27 +320,18 @@ class Connection:
             if isinstance(message, messages.ResumeMessage):
                 session = self.stepper.attach(message.session, self)
             else:
-                if self.session and self.session.name in self.stepper.sessions:
-                    self.stepper.close(self.session.name)
-                session = self.stepper.open(message.robot, message.scene)
-                self.stepper.attach(session.name, self)
+                session = self.stepper.open(message.robot, message.scene, self)
             self._show_all(session)
             return session
 
         try:
-            entered = await asyncio.wrap_future(self.stepper.call(enter))
+            self.session = await asyncio.wrap_future(self.stepper.call(enter))
         except HMAError as fault:
             ended = isinstance(message, messages.ResumeMessage)
             self.tell({"kind": "gone" if ended else "error", "text": str(fault)})
-            return
         except Exception as fault:  # a bug of ours; the stepper has logged it
             text = f"stopped with {type(fault).__name__}: {fault}; the terminal has more"
             self.tell({"kind": "error", "text": text})
-            return
-        if self.session and self.session.name != entered.name:
-            left = self.session.name
-            self.stepper.call(lambda: self.stepper.detach(left, self))
-        self.session = entered
 
     def _show_all(self, session: Session) -> None:
         self.tell(session.opened())
@@ -354,7 +339,7 @@ class Connection:
 
     def _change(self, session: Session, message: messages.Message) -> None:
         """Do what a message says, in the stepper's thread."""
-        if session.name not in self.stepper.sessions or session.viewer is not self:
+        if self.stepper.watched(self) is not session:
             return
         session.touched = time.monotonic()
         try:

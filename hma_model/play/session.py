@@ -6,6 +6,7 @@ H×W pixels, A action dims, K = stride * A values of a chunk.
 """
 
 import math
+import time
 from collections import deque
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -20,12 +21,13 @@ from hma_model.evaluation.calibration import POWER
 from hma_model.evaluation.metrics import PSNR_LIMIT, psnr
 from hma_model.generation.unmask import Decoding
 from hma_model.play.pads import describe
-from hma_model.worlds.scenes import Drivable, LabScene
+from hma_model.worlds.scenes import Drivable, LabScene, RecordedScene
 from hma_model.worlds.world import World
 
 RESTART_FRAMES = 8  # frames that a restart of the model is given
 KEPT_FRAMES = 3000  # frames to save
 QUALITY = 92  # of JPEG
+Scene = LabScene | RecordedScene
 
 
 @dataclass(frozen=True)
@@ -80,13 +82,13 @@ class Session:
     """
 
     def __init__(
-        self, name: str, robot: Drivable, number: int, world: World, sampling: Decoding, now: float
+        self, name: str, robot: Drivable, number: int, scene: Scene, world: World, sampling: Decoding
     ) -> None:
         self.name = name
         self.robot = robot
         self.world = world
         self.viewer: Viewer | None = None
-        self.due = self.touched = now
+        self.due = self.touched = time.monotonic()
         self.paused = True
         self.replays = False
         self.fast = False
@@ -96,7 +98,7 @@ class Session:
         self._times: deque[float] = deque(maxlen=40)
         self._stated = 0.0
         self.sample(sampling)
-        self._begin(number)
+        self._begin(number, scene)
         self.row = world.open(robot.embodiment.id, *self._history())
         with ExitStack() as undo:
             undo.callback(world.close, self.row)
@@ -115,14 +117,14 @@ class Session:
 
     def begin(self, number: int) -> None:
         """Begin another scene, or the same anew."""
-        self._begin(number)
+        self._begin(number, self.robot.scene(number))
         self.world.reset(self.row, *self._history())
         self._set_start()
 
-    def _begin(self, number: int) -> None:
+    def _begin(self, number: int, scene: Scene) -> None:
         self.number = number
-        self.scene = self.robot.scene(number)
-        prompt = self.scene.prompt
+        self.scene = scene
+        prompt = scene.prompt
         self._true: deque[Images] = deque(prompt.frames, maxlen=RESTART_FRAMES)
         self._chunks: deque[Float32s] = deque(prompt.chunks, maxlen=RESTART_FRAMES - 1)
         self.held = self.scene.action.copy()
@@ -242,7 +244,7 @@ class Session:
 
     def _rate(self, now: float) -> float:
         """Return the frames a second of the last 2 s or so."""
-        recent = [time for time in self._times if now - time < 2.0]
+        recent = [then for then in self._times if now - then < 2.0]
         return round((len(recent) - 1) / (now - recent[0]), 1) if len(recent) > 1 and now > recent[0] else 0.0
 
     # -- what the page shows

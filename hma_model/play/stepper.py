@@ -76,6 +76,8 @@ class Stepper:
         future: Future[T] = Future()
 
         def job() -> None:
+            if not future.set_running_or_notify_cancel():
+                return  # its page has left
             try:
                 future.set_result(function())
             except Exception as fault:
@@ -86,14 +88,13 @@ class Stepper:
         self._jobs.put(job)
         return future
 
-    def wake(self) -> None:
-        """Look for sessions that are due."""
-        self._jobs.put(lambda: None)
-
     # -- in the thread
 
-    def open(self, key: str, number: int) -> Session:
+    def open(self, key: str, number: int, viewer: Viewer | None = None) -> Session:
         """Open a session of a robot in a scene; it is paused.
+
+        Args:
+            viewer: watches it, in the place of the session that it watched, which ends.
 
         Raises:
             UsageError: there is no such robot, or there are too many sessions.
@@ -101,7 +102,8 @@ class Stepper:
         robot = self.robots.get(key)
         if robot is None:
             raise UsageError("robot", f"there is no {key[:40]!r}", f"known: {', '.join(self.robots)}")
-        if len(self.sessions) >= self.most:
+        before = self.watched(viewer)
+        if len(self.sessions) - (before is not None) >= self.most:
             now = time.monotonic()
             left = [one for one in self.sessions.values() if one.viewer is None or self._idle(one, now)]
             if not left:
@@ -109,7 +111,11 @@ class Stepper:
                 raise UsageError("sessions", fault, "close another page, or try again in a few minutes")
             said = "Closed after a while without input: another page needed the session."
             self.close(min(left, key=lambda one: (one.viewer is not None, one.touched)).name, said)
-        session = Session(secrets.token_urlsafe(18), robot, number, *self._worlds[key], time.monotonic())
+        scene = robot.scene(number)  # if there is none, the session before stays
+        if before:
+            self.close(before.name)
+        session = Session(secrets.token_urlsafe(18), robot, number, scene, *self._worlds[key])
+        session.viewer = viewer
         self.sessions[session.name] = session
         return session
 
@@ -124,14 +130,19 @@ class Stepper:
             raise UsageError("session", "has ended", "open a new one")
         if session.viewer is not None and session.viewer is not viewer:
             session.viewer.tell({"kind": "closed", "text": "This robot is now driven from another page."})
+        self.detach(viewer)
         session.viewer = viewer
         session.touched = time.monotonic()
         return session
 
-    def detach(self, name: str, viewer: Viewer) -> None:
-        """Let a session stand still that this viewer watched."""
-        session = self.sessions.get(name)
-        if session and session.viewer is viewer:
+    def watched(self, viewer: Viewer | None) -> Session | None:
+        """Return the session that a viewer watches."""
+        own = [one for one in self.sessions.values() if viewer and one.viewer is viewer]
+        return own[0] if own else None
+
+    def detach(self, viewer: Viewer) -> None:
+        """Let the session stand still that a viewer watched."""
+        if session := self.watched(viewer):
             session.viewer = None
 
     def change(self, session: Session, sampling: Decoding) -> None:

@@ -116,6 +116,8 @@ def test_the_device_and_precision_reach_the_world(tmp_path, served, image, monke
     words = ["play", str(tmp_path / "model"), "--prompt", image, "--no-browser"]
     assert main([*words, "--precision", "bf16", "--device", "cuda", "--compile"]) == 0
     assert served[0][-1] == {"device": "cuda", "precision": "bf16", "compile": True, "first": "arm:images"}
+    assert main([*words, "--host", "0.0.0.0", "--token", ""]) == 0
+    assert served[1][4]  # an empty token is none
 
 
 def test_the_bundled_models_robots_were_measured() -> None:

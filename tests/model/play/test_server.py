@@ -2,7 +2,9 @@
 
 import asyncio
 import json
+import socket
 import struct
+import threading
 from collections.abc import Iterator
 from io import BytesIO
 from types import SimpleNamespace
@@ -184,6 +186,44 @@ def test_a_page_that_reads_nothing_skips_frames_and_gets_the_latest(client, step
         assert page.frame()[0]["frame"] == 8
 
 
+def test_a_page_that_leaves_while_its_robot_is_opened_keeps_no_session(client, stepper, monkeypatch) -> None:
+    robot, begun, left = stepper.robots["mover_04"], threading.Event(), threading.Event()
+    made = robot.scene(0)
+    monkeypatch.setattr(robot, "scene", lambda number: (begun.set(), left.wait(10)) and made)
+    with client.websocket_connect(DRIVE) as socket:
+        PageViewer(socket).send("open", robot="mover_04")
+        assert begun.wait(10)
+    left.set()
+    watching = stepper.call(lambda: [one.viewer for one in stepper.sessions.values()])
+    assert watching.result(10) == [None]
+
+
+def test_a_page_ends_no_session_that_another_page_drives_now(client: TestClient, stepper: Stepper) -> None:
+    with client.websocket_connect(DRIVE) as first, client.websocket_connect(DRIVE) as second:
+        one, other = PageViewer(first), PageViewer(second)
+        name = one.open()["session"]
+        other.send("resume", session=name)
+        other.see(other.frame()[0])
+        one.open("arm2_12")
+        other.works()
+        assert len(stepper.sessions) == 2
+
+
+def test_a_robot_that_cannot_be_opened_leaves_the_session_as_it_is(client, stepper, monkeypatch) -> None:
+    monkeypatch.setattr(stepper, "most", 1)
+    monkeypatch.setattr(stepper.robots["arm2_12"], "scene", None)
+    with client.websocket_connect(DRIVE) as socket:
+        page = PageViewer(socket)
+        page.open()
+        for robot in ("nobody", "arm2_12"):
+            page.send("open", robot=robot)
+            page.message("error")
+            page.works()
+        page.open()
+        page.works()
+        assert len(stepper.sessions) == 1
+
+
 WRONG = {
     "no JSON": "{",
     "no object": "[]",
@@ -191,6 +231,7 @@ WRONG = {
     "another field": '{"do": "step", "path": "/etc"}',
     "NaN": '{"do": "drive", "action": [NaN, 0], "input": 1}',
     "infinite": '{"do": "drive", "action": [1e999, 0], "input": 1}',
+    "infinite as float32": '{"do": "drive", "action": [1e300, 0], "input": 1}',
     "text": '{"do": "drive", "action": ["1", "2"], "input": 1}',
     "deep": "[" * 5000,
     "huge": '{"do": "resume", "session": "' + "x" * MAX_MESSAGE_BYTES + '"}',
@@ -274,9 +315,12 @@ def test_its_own_origin_is_let_in(client: TestClient) -> None:
         PageViewer(socket).message("hello")
 
 
-def test_a_token_is_needed_where_one_is_set(stepper: Stepper) -> None:
+def test_a_token_is_needed_where_one_is_set(stepper: Stepper, monkeypatch) -> None:
     app = Server(stepper, "a model", "0.0.0.0", "a&b é").app
     page = "/?token=a%26b%20%C3%A9"
+    monkeypatch.setattr(socket, "gethostname", lambda: "Lab-Mac.local")  # browsers send it in lower case
+    with TestClient(app, "http://lab-mac.local:8000") as client:
+        assert client.get(page).status_code == 200
     with TestClient(app, "http://192.168.1.7:8000") as client:
         assert [client.get(path).status_code for path in ("/", "/?token=wr%F6ng", page)] == [
             403, 403, 200,

@@ -1,5 +1,6 @@
 """The stepper of `hma play`: clocks, batches, the truth beside the model, and sessions that end."""
 
+import threading
 from dataclasses import replace
 from typing import Any
 
@@ -94,7 +95,7 @@ def test_a_paused_session_makes_single_frames_and_one_without_viewer_none() -> N
     bench.step(3)
     assert [frame.number for frame in viewer.frames] == [1]
     session.paused = False
-    bench.stepper.detach(session.name, viewer)
+    bench.stepper.detach(viewer)
     bench.step(3)
     assert session.count == 1
 
@@ -221,7 +222,7 @@ def test_an_idle_session_is_paused_and_keeps_its_frames_but_is_closed_if_nobody_
     bench.step()
     for session in (idle, left):
         session.touched -= 61
-    bench.stepper.detach(left.name, away)
+    bench.stepper.detach(away)
     bench.step(3)
     assert list(bench.stepper.sessions) == [idle.name, busy.name]
     assert list(bench.world.rows) == [idle.row, busy.row]
@@ -243,7 +244,7 @@ def test_a_full_engine_refuses_and_gives_the_places_of_those_who_left() -> None:
     (first, viewer), _ = bench.open(), bench.open()
     with pytest.raises(UsageError, match="all 2 sessions are in use"):
         bench.stepper.open("mover_04", 0)
-    bench.stepper.detach(first.name, viewer)
+    bench.stepper.detach(viewer)
     bench.open()
     assert first.name not in bench.stepper.sessions
 
@@ -274,5 +275,10 @@ def test_the_thread_runs_calls_and_hands_back_their_errors() -> None:
         assert session.name in bench.stepper.sessions
         with pytest.raises(UsageError, match="no 'nobody'"):
             bench.stepper.call(lambda: bench.stepper.open("nobody", 0)).result(10)
+        begun = threading.Event()
+        bench.stepper.call(lambda: begun.wait(10))
+        assert bench.stepper.call(lambda: bench.stepper.open("mover_04", 0)).cancel()  # its page has left
+        begun.set()
+        assert bench.stepper.call(lambda: len(bench.stepper.sessions)).result(10) == 1
     finally:
         bench.stepper.stop()
