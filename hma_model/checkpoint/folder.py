@@ -336,14 +336,23 @@ def _own_colors(config: HMAConfig) -> str:
     return f" --weights PATH, the path of the model's {CONFIG}"
 
 
+def value_of(values: Any, key: str) -> Any:
+    """Return the value of a key of a card's part; None also if the part is no object."""
+    return values.get(key) if isinstance(values, dict) else None
+
+
 def action_stats(stats: Mapping[str, Any], where: object) -> ActionStats:
     """Return the mean and std of the actions from the values of stats.json."""
     try:
         action = stats["action"]
         rule = str(action.get("zero_variance", "zero"))
-        return ActionStats([float(v) for v in action["mean"]], [float(v) for v in action["std"]], rule)
+        keys = ("mean", "std", *(key for key in ("min", "max") if key in action))
+        mean, std, *ends = ([float(v) for v in action[key]] for key in keys)
     except (AttributeError, KeyError, TypeError, ValueError) as fault:
         raise CheckpointError(where, "lacks action.mean or action.std as lists of numbers") from fault
+    if any(len(end) != len(mean) for end in ends):
+        raise CheckpointError(where, "has action.min or action.max of another length than action.mean")
+    return ActionStats(mean, std, rule)
 
 
 def _require_same(

@@ -49,7 +49,7 @@ def push(
     Example: hma hub push runs/first ./my-hub/team/model -e my_arm
     """
     from hma_data.errors import UsageError
-    from hma_model.checkpoint.folder import Checkpoint
+    from hma_model.checkpoint.folder import Checkpoint, value_of
     from hma_model.cli.export import export_checkpoint
     from hma_model.export.space import Space
     from hma_model.hub import publish as hub
@@ -72,8 +72,8 @@ def push(
             say(f"the page runs at {static.publish(exported, target, cards.values())}")
     for name, card in opened.cards(embodiment).items():
         judged = card.get("evaluation")
-        if judged and not judged["follows"]:
-            say(f"{name} {judged['verdict']}; the model card starts with this verdict")
+        if value_of(judged, "follows") is False:
+            say(f"{name} {_cell(judged.get('verdict'), 400)}; the model card starts with this verdict")
     robots = "".join(f" -e {shlex.quote(name)}" for name in embodiment or ())
     say(f"fetch it: hma hub pull {shlex.quote(target)}{robots} --out {_folder_for(target)}")
 

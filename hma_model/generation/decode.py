@@ -16,7 +16,7 @@ from hma_data.storage.paths import StrPath, as_text
 from hma_data.tokenizers.base import Tokenizer
 from hma_data.tokenizers.network import NetworkTokenizer
 from hma_model.arrays import Images
-from hma_model.checkpoint.folder import EMBEDDED_NAME, resolve
+from hma_model.checkpoint.folder import EMBEDDED_NAME, resolve, value_of
 from hma_model.network.model import HMA
 from hma_model.network.network import Network
 
@@ -61,8 +61,7 @@ def cameras_for(model: Network, shards: ShardSet, cameras: Cameras | None = None
         UsageError: these are more or fewer than the views of the model.
     """
     if cameras is None and model.source:
-        card = model.source.card(shards.embodiment.id)
-        cameras = card.get("data", {}).get("cameras")
+        cameras = value_of(model.source.card(shards.embodiment.id).get("data"), "cameras")
     cameras = FIRST_CAMERA if cameras is None else cameras
     if (count := view_count(cameras)) != model.config.views:
         fault = f"are {count} in a frame, but the model takes {model.config.views}"

@@ -9,7 +9,7 @@ from typing import Any
 from hma_data.errors import HMAError, HubError, PluginError, TokenizerError
 from hma_data.storage.files import json_object
 from hma_data.storage.paths import StrPath
-from hma_model.checkpoint.folder import CARD, CONFIG, LIBRARY, PARTS, TRUNK, digest, parse_config
+from hma_model.checkpoint.folder import CARD, CONFIG, LIBRARY, PARTS, TRUNK, digest, parse_config, value_of
 from hma_model.hub.stores import Store, embodiment_ids, open_store
 
 RELEASED_WEIGHTS = ("model.safetensors", "pytorch_model.bin")
@@ -107,7 +107,7 @@ def _add_ours(
                 wrong.append("was trained on another tokenizer")
         except HMAError as fault:
             card, wrong = {}, [fault.fault]
-        if origin := _value_of(card.get("data"), "released_checkpoint"):
+        if origin := value_of(card.get("data"), "released_checkpoint"):
             facts["origin"] = f"imported from {origin}"
         facts["embodiments"].append(_row(name, card, size, wrong))
 
@@ -117,8 +117,8 @@ def _row(name: str, card: Mapping[str, Any], size: int | None, problems: list[st
         "embodiment": name,
         **{key: card.get(key) for key in ("robot", "action_dim", "chunk_dim", "stride", "data")},
         "hz": card.get("effective_hz"),
-        **{key: _value_of(card.get("metrics"), key) for key in FIGURES},
-        "verdict": _value_of(card.get("evaluation"), "verdict"),
+        **{key: value_of(card.get("metrics"), key) for key in FIGURES},
+        "verdict": value_of(card.get("evaluation"), "verdict"),
         "licence": card.get("license"),
         "bytes": size,
         "problems": problems,
@@ -129,7 +129,7 @@ def _tokenizer_problems(tokenizer: Any) -> list[str]:
     """Return the problems that prevent decoding the model's predictions here."""
     from hma_data.tokenizers.catalog import find_entry, other_weights
 
-    name = _value_of(tokenizer, "name")
+    name = value_of(tokenizer, "name")
     try:
         entry = find_entry(str(name))
     except PluginError as fault:
@@ -140,7 +140,3 @@ def _tokenizer_problems(tokenizer: Any) -> list[str]:
         return [f"tokenizer {name} has weights of its own ({digest[:12]}…): decoding needs them"]
     missing = entry.missing()
     return [f"tokenizer {name} needs {', '.join(missing)}: {entry.extra}"] if missing else []
-
-
-def _value_of(values: Any, key: str) -> Any:
-    return values.get(key) if isinstance(values, dict) else None

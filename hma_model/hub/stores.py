@@ -12,7 +12,6 @@ import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from fnmatch import fnmatchcase
 from pathlib import Path
 
 from hma_data.errors import HubError, MissingDependencyError, OutputError, StorageAwayError, StorageError
@@ -228,7 +227,8 @@ def open_published(source: StrPath, revision: str | None) -> tuple[Store, dict[s
 
 def embodiment_ids(files: Iterable[str]) -> list[str]:
     """Return the ids that have a card, which is written last, in a listing of a checkpoint's files."""
-    found = {path.split("/")[1] for path in files if fnmatchcase(path, f"embodiments/*/{CARD}")}
+    split = (path.split("/") for path in files)
+    found = {parts[1] for parts in split if parts[:1] + parts[2:] == ["embodiments", CARD]}
     return sorted(name for name in found if ID_PATTERN.fullmatch(name) and ".." not in name)
 
 

@@ -8,7 +8,7 @@ import json
 from dataclasses import dataclass
 from importlib.resources import files
 
-from hma_model.checkpoint.folder import Checkpoint
+from hma_model.checkpoint.folder import Checkpoint, value_of
 
 MEASURED = "holding.json"  # by the trunk's SHA-256
 
@@ -51,7 +51,7 @@ def holdings(checkpoint: Checkpoint) -> dict[str, Holding]:
     known = measured.get(checkpoint.trunk_sha256, {})
     found = {}
     for name in checkpoint.embodiments:
-        verdict = str((checkpoint.card(name).get("evaluation") or {}).get("verdict", ""))
+        verdict = str(value_of(checkpoint.card(name).get("evaluation"), "verdict"))
         says = {"follows": True, "does not follow": False}
         follows = next((value for words, value in says.items() if verdict.startswith(words)), None)
         own = known.get(name, {})

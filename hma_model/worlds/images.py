@@ -18,7 +18,7 @@ from hma_data.storage.kinds import misplaced
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.arrays import Float32s, Images
-from hma_model.checkpoint.folder import SAMPLE, Checkpoint
+from hma_model.checkpoint.folder import SAMPLE, Checkpoint, value_of
 from hma_model.config import HMAConfig
 
 
@@ -64,7 +64,8 @@ def image_shape(config: HMAConfig) -> tuple[int, int, int]:
 
 def trained_cameras(card: Mapping[str, Any]) -> Cameras:
     """Return the cameras that a robot's stem was trained on, by its card."""
-    return card.get("data", {}).get("cameras") or FIRST_CAMERA
+    cameras = value_of(card.get("data"), "cameras")
+    return cameras if cameras and isinstance(cameras, str | list) else FIRST_CAMERA
 
 
 def seen_cameras(cameras: Cameras, stored: Sequence[str]) -> list[str]:

@@ -135,6 +135,12 @@ def refuses(case: str, act: str) -> bool:
     return act == "push" or case != "the card of another robot"  # which others can live with
 
 
+def test_a_range_that_is_not_of_the_action_is_refused(folder: Path) -> None:
+    values("action", min=[0.0])(folder / STATS)
+    with pytest.raises(HMAError, match=r"stats\.json: has action\.min or action\.max of another length"):
+        checkpoint.Checkpoint.open(folder).stats("arm")
+
+
 @pytest.mark.parametrize("case", HOSTILE)
 def test_a_hostile_checkpoint_is_neither_loaded_nor_pushed_nor_pulled(folder, tmp_path, monkeypatch, case):
     name, spoil, said = HOSTILE[case]

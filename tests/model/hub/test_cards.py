@@ -23,6 +23,8 @@ from hma_model.hub import publish as hub
 from hma_model.hub.datasets import pull_data, push_data
 from hma_model.hub.listing import list_embodiments, survey
 from hma_model.network.model import HMA
+from hma_model.play.holding import holdings
+from hma_model.worlds.images import trained_cameras
 from recipes.bench import holds
 from tests.hostile import cut, values
 from tests.model.robots import edit_card, make_model, save
@@ -256,6 +258,14 @@ def test_a_broken_card_of_somebody_else_stops_neither_list_nor_push(folder, tmp_
     rows = {row["embodiment"]: row["problems"] for row in facts["embodiments"]}
     assert rows["arm"] and not rows["hand"]
     assert list(HMA.from_pretrained(str(tmp_path / "hub"), ["hand"]).embodiments) == ["hand"]
+
+
+def test_a_broken_card_of_ones_own_stops_neither_push_nor_play(folder, tmp_path, capsys):
+    for data, evaluation in (({"cameras": 3}, {"verdict": 1, "follows": False}), ([], "follows")):
+        values(data=data, evaluation=evaluation)(folder / "embodiments/arm/card.json")
+        assert main(["hub", "push", str(folder), str(tmp_path / "hub")]) == 0
+        opened = Checkpoint.open(folder)
+        assert holdings(opened)["arm"].follows is None and trained_cameras(opened.card("arm")) == "first"
 
 
 def test_stems_trained_apart_generate_together_what_each_generates_alone(folder, tmp_path):

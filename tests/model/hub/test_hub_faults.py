@@ -51,6 +51,12 @@ def test_hubs_of_other_habits_are_pushed_to_and_pulled_from(server, source, habi
     }
 
 
+def test_a_card_in_a_folder_of_an_embodiment_is_not_that_embodiments(published, source):
+    published.model(REPO).commit({f"{place}embodiments/foot/old/card.json": b"{}" for place in ("", "x/")})
+    assert [row["embodiment"] for row in list_embodiments(REPO)] == ["arm", "hand"]
+    hub.push(source, REPO)
+
+
 def test_a_failed_transfer_by_xet_goes_on_by_lfs(server, source, monkeypatch):
     from huggingface_hub import _commit_api
 
