@@ -83,9 +83,9 @@ class Guard:
         # An address cannot be rebound; of names, only this server's own are let in.
         own_name = name in (*LOOPBACK, self.host.lower())  # `name` is in lower case
         if not own_name and self.host not in LOOPBACK:
+            own_name = name == socket.gethostname().lower()
             with contextlib.suppress(ValueError):
                 own_name = bool(ipaddress.ip_address(name))
-            own_name = own_name or name == socket.gethostname().lower()
         if not own_name:
             return f"refused: the host {host[:80]!r} is not this server's"
         if not own:
@@ -327,8 +327,8 @@ class Connection:
         try:
             self.session = await asyncio.wrap_future(self.stepper.call(enter))
         except HMAError as fault:
-            ended = isinstance(message, messages.ResumeMessage)
-            self.tell({"kind": "gone" if ended else "error", "text": str(fault)})
+            kind = "gone" if isinstance(message, messages.ResumeMessage) else "error"
+            self.tell({"kind": kind, "text": str(fault)})
         except Exception as fault:  # a bug of ours; the stepper has logged it
             text = f"stopped with {type(fault).__name__}: {fault}; the terminal has more"
             self.tell({"kind": "error", "text": text})
@@ -368,13 +368,15 @@ class Connection:
                 case messages.SwitchMessage(do="replay"):
                     session.replays = message.on
                     session.ended = False
-                case messages.SampleMessage():
+                case messages.SampleMessage(order=order):
+                    if order not in (known := self.stepper.orders):
+                        raise UsageError(
+                            "order", f"this model has no {order!r}", f"known: {', '.join(known)}"
+                        )
                     warmth = round(message.temperature, 1)
                     steps = message.passes or session.sampling.unmask_steps
-                    way = replace(
-                        session.sampling, unmask_steps=steps, temperature=warmth, order=message.order
-                    )
-                    self.stepper.change(session, way)
+                    way = replace(session.sampling, unmask_steps=steps, temperature=warmth, order=order)
+                    session.sample(way)
             self.tell(session.status())
         except HMAError as fault:
             self.tell({"kind": "error", "text": str(fault)})

@@ -221,12 +221,10 @@ class Session:
             self.touched = now
             self.held = actions[-1].copy()
         if self.viewer:
-            facts: dict[str, Any] = {
-                "ms": round(1000 * took, 1),
-                "rate": self._rate(now),
-                "input": self.input,
-            }
-            facts |= {"action": actions[-1].tolist(), "parted": self.parted, "meter": self.metered}
+            facts = {
+                "ms": round(1000 * took, 1), "rate": self._rate(now), "input": self.input,
+                "action": actions[-1].tolist(), "parted": self.parted, "meter": self.metered,
+            }  # fmt: skip
             self.viewer.show(frame, facts)
 
     @property
@@ -264,9 +262,10 @@ class Session:
     def opened(self) -> dict[str, Any]:
         """Return all that a page needs to go on with the session, as plain values."""
         scores = [[frame.number, frame.psnr, frame.still] for frame in list(self.frames)[-600:]]
-        about = {"session": self.name, "robot": describe(self.robot), "held": self.held.tolist()}
-        about |= {"input": self.input}
-        return self.status() | about | {"kind": "opened", "scores": scores}
+        return self.status() | {
+            "kind": "opened", "scores": scores, "session": self.name, "robot": describe(self.robot),
+            "held": self.held.tolist(), "input": self.input,
+        }  # fmt: skip
 
     def film(self) -> list[Frame]:
         """Return the frames that are kept, after the prompt's last one if they begin there."""

@@ -137,25 +137,12 @@ class Stepper:
 
     def watched(self, viewer: Viewer | None) -> Session | None:
         """Return the session that a viewer watches."""
-        own = [one for one in self.sessions.values() if viewer and one.viewer is viewer]
-        return own[0] if own else None
+        return next((one for one in self.sessions.values() if viewer and one.viewer is viewer), None)
 
     def detach(self, viewer: Viewer) -> None:
         """Let the session stand still that a viewer watched."""
         if session := self.watched(viewer):
             session.viewer = None
-
-    def change(self, session: Session, sampling: Decoding) -> None:
-        """Go on with another sampling.
-
-        Raises:
-            UsageError: the model cannot decode in that order.
-        """
-        if sampling.order not in self.orders:
-            raise UsageError(
-                "order", f"this model has no {sampling.order!r}", f"known: {', '.join(self.orders)}"
-            )
-        session.sample(sampling)
 
     def close(self, name: str, reason: str = "") -> None:
         """Close a session, and tell its viewer why."""

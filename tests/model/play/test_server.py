@@ -284,12 +284,15 @@ def test_a_page_cannot_begin_scenes_so_often_that_the_others_wait(client, steppe
         assert 5 <= len(world.begun) <= MESSAGE_BURST / SCENE_COST
 
 
-def test_wrong_values_are_told_and_the_session_goes_on(client: TestClient) -> None:
+def test_wrong_values_are_told_and_the_session_goes_on(client: TestClient, stepper: Stepper) -> None:
     with client.websocket_connect(DRIVE) as socket:
         page = PageViewer(socket)
         page.send("open", robot="nobody")
         assert "there is no 'nobody'" in page.message("error")["text"]
         page.open()
+        stepper.orders = ("random",)
+        page.send("sample", passes=2, temperature=0, order="confidence")
+        assert "no 'confidence' — known: random" in page.message("error")["text"]
         page.send("drive", action=[1, 2, 3], input=1)
         assert "has 3 values, this robot takes 2" in page.message("error")["text"]
         page.works()

@@ -195,14 +195,12 @@ def test_a_step_that_still_waits_at_a_sync_is_not_made_from_the_true_frames() ->
 
 
 def test_sessions_of_another_sampling_have_a_pass_of_their_own() -> None:
-    bench = Bench(orders=("random",))
+    bench = Bench()
     one, other, third = (bench.open()[0] for _ in range(3))
-    bench.stepper.change(other, Decoding(4, 0.5, "random"))
+    other.sample(Decoding(4, 0.5, "random"))
     bench.step()
     assert bench.world.sampling == [(2, 0.0, "random"), (4, 0.5, "random")]
     assert [set(step) for step in bench.world.steps] == [{one.row, third.row}, {other.row}]
-    with pytest.raises(UsageError, match="no 'confidence'"):
-        bench.stepper.change(one, Decoding(2, 0.0, "confidence"))
 
 
 def test_a_new_scene_begins_anew_and_the_same_scene_is_the_same() -> None:
