@@ -156,11 +156,18 @@ async function begin(number) {
   begun = false; wanted = 0;
   follow(false);
   if (!robot.simulator) showTruth(false);
-  await making;
+  const ready = making.then(restart);  // no frame is made meanwhile, and no other start begins
+  making = ready.catch(() => {});
+  await ready;
+}
+
+async function restart() {
   await showing;
+  const current = world;
   made = frame = 0;
   await poster();
-  await world.begin(start);
+  if (current) await current.begin(start);
+  if (!current || current !== world) return;  // another robot was chosen meanwhile
   table = canvas && new Table(robot.simulator.body, robot.simulator.tables[start]);
   showTruth(Boolean(table));
   if (table) drawTruth(table.shapes());
@@ -175,6 +182,7 @@ async function begin(number) {
 
 async function loop() {
   for (;;) {
+    await making;  // a start that begins
     const now = performance.now();
     const ended = replaying && made === replays[start].chunks.length;  // its last image is still to come
     if (world && (wanted > 0 || !paused) && !ended && now >= due) {

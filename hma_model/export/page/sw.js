@@ -17,7 +17,7 @@ async function answer(request, url, own) {
   if (kept) return isolated(kept, own);
   try {
     const found = await fetch(request);
-    if (found.status === 200) await cache.put(url.href, found.clone());
+    if (found.status === 200) await cache.put(url.href, found.clone()).catch(() => {});  // the storage may be full
     return isolated(found, own);
   } catch (fault) {
     const older = await cache.match(url.href);

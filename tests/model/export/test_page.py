@@ -250,6 +250,36 @@ def test_keys_are_looked_at_before_each_frame(page: "Page", server: Any) -> None
     page.wait_for_function("kept.length && kept[kept.length - 1][0].some((value) => value)", polling=50)
 
 
+SLOW_GRAPHS = """
+const post = Worker.prototype.postMessage;
+Worker.prototype.postMessage = function (...given) { setTimeout(() => post.apply(this, given), 50); };
+"""
+
+
+def test_a_reset_that_is_driven_at_once_and_pressed_twice_begins_anew(page: "Page", server: Any) -> None:
+    page.add_init_script(SLOW_GRAPHS)
+    page.goto(address(server))
+    page.wait_for_selector("#veil", state="hidden")
+    made = []
+    for ids in (["run"], ["reset", "run"], ["reset", "reset", "run"]):
+        page.evaluate("(ids) => ids.forEach((id) => document.getElementById(id).click())", ids)
+        frames(page, 5, 1)
+        page.click("#run")  # pauses
+        page.wait_for_timeout(1000)
+        made.append(page.evaluate("kept.splice(0).slice(0, 5)"))
+    assert made[0] == made[1] == made[2]
+
+
+def test_a_browser_whose_storage_is_full_drives(page: "Page", server: Any) -> None:
+    full = {"origin": f"http://127.0.0.1:{server.server_port}", "quotaSize": 1000}
+    page.context.new_cdp_session(page).send("Storage.overrideQuotaForOrigin", full)
+    page.goto(address(server))
+    page.wait_for_selector("#veil", state="hidden")
+    assert page.evaluate("crossOriginIsolated")
+    page.click("#run")
+    frames(page, 1, 1)
+
+
 def test_a_truncated_graph_and_a_missing_manifest_are_one_clear_line(page, server, site) -> None:
     folder = site / "sub" / "page"
     graph = folder / "page-step.onnx"
