@@ -161,7 +161,8 @@ def published_envs(file: str, repo: str | None, n_envs: int, cfg: Any = None) ->
     given = {} if cfg is None else dict(vars(cfg))
     names = [given["embodiment"]] if given.get("embodiment") else None
     checkpoint, chosen = located(source, names)
-    world = load_world(source, names, device=given.get("device", "cpu"))
+    own = {key: given[key] for key in ("device", "unmask_steps", "temperature") if key in given}
+    world = load_world(source, names, **own)
     return {name: {0: made(checkpoint, name, n_envs, world, given)} for name in chosen}
 
 

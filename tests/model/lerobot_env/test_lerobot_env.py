@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -159,6 +160,13 @@ def test_a_published_checkpoint_makes_environments(server: Hub) -> None:
     push("embedded", REPO, [ROBOT])
     envs = make_env(REPO, n_envs=2, use_async_envs=True, trust_remote_code=True)
     assert list(envs) == [ROBOT] and envs[ROBOT][0].num_envs == 2
+
+
+def test_a_published_checkpoint_draws_frames_as_its_configuration_says() -> None:
+    file = Checkpoint.open("embedded", [ROBOT]).folder / "env.py"
+    given = SimpleNamespace(embodiment=ROBOT, unmask_steps=1, temperature=0.5)
+    drawn = lerobot_env.published_envs(str(file), None, 1, given)[ROBOT][0].world.decoding
+    assert (drawn.unmask_steps, drawn.temperature) == (1, 0.5)
 
 
 def test_a_repository_is_loaded_in_the_revision_of_its_file(monkeypatch: pytest.MonkeyPatch) -> None:
