@@ -129,7 +129,7 @@ def read_prompt(model: HMA, embodiment: str, prompt: Any = None, *, seed: int = 
     if isinstance(prompt, Sequence) and prompt and isinstance(prompt[0], str | PathLike):
         prompt = [read_image(path, PROMPT_FORMS) for path in prompt]
     try:
-        images = np.asarray(prompt)
+        images = np.atleast_1d(prompt)  # a number is no image, which `fitted` says
     except ValueError as fault:
         raise HMAError("prompt", "its images differ in size", "give images of one size") from fault
     return _of_frames(model, embodiment, images[None] if images.ndim in (2, 3) else images)
@@ -176,7 +176,7 @@ def _of_mapping(model: HMA, embodiment: str, prompt: Mapping[str, Any]) -> Promp
             return read(model, embodiment, given.pop(key), EpisodePart(**given))
     if "frames" not in given or given.keys() - {"frames", "chunks", "actions"}:
         raise HMAError("prompt", f"has the keys {', '.join(map(str, given))}", PROMPT_FORMS)
-    frames = np.asarray(given["frames"])
+    frames = np.atleast_1d(given["frames"])
     if "actions" in given:
         return _strided(model, embodiment, frames, given["actions"])
     return _of_frames(model, embodiment, frames, given.get("chunks"))

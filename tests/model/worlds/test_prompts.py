@@ -20,6 +20,7 @@ from hma_model.cli import main
 from hma_model.network.model import HMA
 from hma_model.simulate import read_prompt, starting_window
 from hma_model.worlds import prompts
+from hma_model.worlds.images import fitted
 from tests.data import cameras as three
 from tests.model.network_parts import small_model
 from tests.model.shards import make_shards, state_pauses
@@ -140,6 +141,12 @@ def test_cameras_recorded_elsewhere_are_paired_by_name_and_the_primary_one_stays
 def test_prompts_that_cannot_be_read_are_refused(model: HMA, prompt: Any, message: str) -> None:
     with pytest.raises(HMAError, match=message):
         read_prompt(model, RAILS, prompt)
+
+
+@pytest.mark.parametrize("prompt", [5, {"frames": 5}])
+def test_a_number_is_no_image(model: HMA, prompt: Any) -> None:
+    with pytest.raises(HMAError, match="give images"):
+        fitted(read_prompt(model, RAILS, prompt).frames, model.config, None)
 
 
 @pytest.mark.slow
