@@ -270,14 +270,10 @@ def training_checkpoints(run: StrPath) -> list[Path]:
 
 def read_metadata(path: Path) -> dict[str, str]:
     """Read the metadata in the header of a safetensors file."""
-    from safetensors import SafetensorError, safe_open
+    from hma_data.tokenizers.shapes import opened_weights
 
-    try:
-        with safe_open(path, framework="np") as file:  # the header alone needs no torch
-            return file.metadata() or {}
-    except (SafetensorError, OSError) as fault:
-        reason = unreadable(path, f"is not a complete safetensors file: {fault}", "pull or save it again")
-        raise CheckpointError(path, *reason) from fault
+    with opened_weights(path, error=CheckpointError) as file:  # the header alone needs no torch
+        return file.metadata() or {}
 
 
 def inside(folder: Path, name: str) -> Path:

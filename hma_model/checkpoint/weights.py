@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hma_data.errors import CheckpointError
-from hma_data.storage.kinds import unreadable
+from hma_data.tokenizers.shapes import opened_weights
 from hma_model.checkpoint.folder import Checkpoint
 
 if TYPE_CHECKING:
@@ -33,14 +33,8 @@ _REMEDY = "pull the checkpoint again; if the error stays, do not use it"
 
 def read_tensors(path: Path) -> State:
     """Read all tensors of a safetensors file to the CPU."""
-    from safetensors import SafetensorError
-    from safetensors.torch import load_file
-
-    try:
-        return load_file(path)
-    except (SafetensorError, OSError) as fault:
-        reason = unreadable(path, f"is not a complete safetensors file: {fault}", "pull or save it again")
-        raise CheckpointError(path, *reason) from fault
+    with opened_weights(path, "pt", CheckpointError) as file:
+        return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
 
 
 def write_tensors(
