@@ -40,7 +40,7 @@ def main() -> None:
     hz, label = robot.embodiment.effective_hz, "recording" if given.shards else "simulator"
     frames, scores = [], []
     for scene in given.scenes:
-        session = Session(given.robot, robot, scene, world, world.decoding, 0.0)
+        session = Session(given.robot, robot, scene, robot.scene(scene), world, world.decoding)
         session.replays = True
         for _ in range(round(given.seconds * hz)):
             chunk = session.next_chunk()
