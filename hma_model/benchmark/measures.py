@@ -13,6 +13,7 @@ are px of an image of 128 by 128.
 """
 
 import time
+from collections import defaultdict
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import replace
@@ -64,8 +65,7 @@ def choose(
         (N, C, T, P, 2) places.
     """
     kept = np.concatenate([probe.own, probe.loose])  # the parts whose places the probe reads
-    names = ("psnr", "copy_psnr", "true", "made", "uncertainty")
-    found: dict[str, list[NDArray[Any]]] = {name: [] for name in names}
+    found = defaultdict[str, list[NDArray[Any]]](list)
     for choice in range(choices):
         true = TrueArena(replace(scenes, seed=scenes.seed + 1000 * choice), world.image_shape[0])
         pictures, actions = run("benchmark", policy, true, frames)

@@ -39,6 +39,7 @@ from hma_model.evaluation.calibration import calibration
 from hma_model.evaluation.intervals import NATURAL, rounded, summary
 from hma_model.evaluation.metrics import PSNR_RANGE
 from hma_model.evaluation.probe import Probe, train_probe
+from hma_model.evaluation.state_reader import Tell
 from hma_model.policies.arenas import Scenes
 from hma_model.policies.fingerprints import device_facts, world_digests, world_facts
 from hma_model.policies.judge import task_of, train_judge
@@ -134,8 +135,8 @@ def benchmark(
 
                 one = _Robot(world, robot, protocol, seed, kept, tell)
                 made[robot], by_scene[robot], by_frame[robot] = one.measured()
-            found = facts | {"checkpoint": str(checkpoint), "measures": made, "by_scene": by_scene}
-            found["by_frame"] = by_frame
+            found = facts | {"checkpoint": str(checkpoint), "measures": made}
+            found |= {"by_scene": by_scene, "by_frame": by_frame}
             write_atomic(folder / RESULTS, json.dumps(found | {"sha256": _digest(found)}, indent=1))
         remove_kept(folder / WORK)  # of a job killed here, too
         for robot, measured in found["measures"].items():
@@ -174,7 +175,7 @@ class _Robot:
     protocol: Protocol
     seed: int
     kept: KeptParts
-    tell: Callable[[str], None]
+    tell: Tell
 
     @cached_property
     def scenes(self) -> Scenes:

@@ -216,13 +216,12 @@ def share_interval(successes: int, count: int) -> tuple[float, float]:
 def precision_recall(true: Bools, judged: Bools) -> tuple[Estimate, Estimate]:
     """Return the share of judged successes (N,) that are true, and that of true ones that are judged so."""
     hits, said, there = int((true & judged).sum()), int(judged.sum()), int(true.sum())
-    found = []
-    for count, missing in ((said, "nothing is judged a success"), (there, "nothing truly succeeds")):
-        if count:
-            found.append(Estimate(hits / count, *share_interval(hits, count)))
-        else:
-            found.append(Estimate(None, reason=missing))
-    return found[0], found[1]
+
+    def share(count: int, missing: str) -> Estimate:
+        ends = share_interval(hits, count)
+        return Estimate(hits / count, *ends) if count else Estimate(None, reason=missing)
+
+    return share(said, "nothing is judged a success"), share(there, "nothing truly succeeds")
 
 
 def auroc(true: Bools, scores: Floats, seed: int = 0) -> Estimate:

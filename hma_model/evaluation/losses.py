@@ -75,8 +75,9 @@ def windows(
 
 
 def episodes_of(batches: Sequence[Batch]) -> Ints:
-    """Return the episode (N,) of each window; windows whose episode is unknown count as one each."""
-    return np.concatenate([np.arange(len(b)) if b.episode is None else b.episode.numpy() for b in batches])
+    """Return the episode (N,) of each window of a shard set."""
+    known: Any = [batch.episode for batch in batches]
+    return np.concatenate(known)
 
 
 def no_window(shards: ShardSet, split: str, frames: int) -> UsageError:

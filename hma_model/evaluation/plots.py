@@ -30,7 +30,7 @@ def loss_curves(training: Mapping[str, Points], validation: Mapping[str, Points]
         training, validation: robot -> its losses.
         label: the label of the losses' axis.
     """
-    figure, axes = _axes("training step", label)
+    figure, axes = labelled_axes("training step", label)
     for i, name in enumerate(sorted(training)):
         colour, style = COLOURS[i % len(COLOURS)], STYLES[i // len(COLOURS) % len(STYLES)]
         steps, losses = np.array(training[name], float).T
@@ -47,7 +47,7 @@ def loss_curves(training: Mapping[str, Points], validation: Mapping[str, Points]
 
 def course(points: Points, label: str, log: bool = False) -> bytes:
     """Plot values over training, on a logarithmic axis if `log` is set."""
-    figure, axes = _axes("training step", label)
+    figure, axes = labelled_axes("training step", label)
     steps, values = np.array(points if len(points) else [(0, np.nan)], float).T
     axes.plot(steps, values, color=COLOURS[0], lw=1.2)
     if log and (values > 0).any():
@@ -67,7 +67,7 @@ def over_horizon(
         seconds_per_frame: seconds between frames of the model.
         unit: the label of the values' axis.
     """
-    figure, axes = _axes("seconds after the prompt", unit)
+    figure, axes = labelled_axes("seconds after the prompt", unit)
     for i, (name, (values, ends)) in enumerate(curves.items()):
         time = seconds_per_frame * np.arange(1, len(values) + 1)
         colour, (low, high) = SIX_COLOURS[i % len(SIX_COLOURS)], np.array(ends, float).T
@@ -79,10 +79,11 @@ def over_horizon(
     return svg_bytes(figure)
 
 
-def _axes(x: str, y: str) -> "tuple[Figure, Axes]":
+def labelled_axes(x: str, y: str, size: tuple[float, float] = (7.2, 3.4)) -> "tuple[Figure, Axes]":
+    """Return a figure of that size in inches with one plot, and the plot's axes."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(7.2, 3.4), layout="constrained")
+    figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots()
     label_axes(axes, x, y)
     return figure, axes

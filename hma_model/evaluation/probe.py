@@ -7,7 +7,6 @@ network reads the place of a disc to a pixel and that of a T to five, because it
 N pictures of S pixels a side, P parts. Places are px of a picture of 128 by 128.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -24,6 +23,7 @@ from hma_model.evaluation.state_reader import (
     INPUT_SIDE,
     UNREADABLE_SHARE,
     PlaceNetwork,
+    Tell,
     outputs,
     resized,
     trained,
@@ -196,7 +196,7 @@ def train_probe(
     tokenizer: Tokenizer,
     stride: int,
     seed: int = 0,
-    tell: Callable[[str], None] = lambda words: None,
+    tell: Tell = lambda words: None,
 ) -> Probe:
     """Train a probe on simulated episodes of a laboratory robot; it takes some 15 CPU seconds, once.
 
@@ -222,7 +222,7 @@ def train_probe(
 
 
 def shown_episodes(
-    robot: str, tokenizer: Tokenizer, stride: int, seed: int, tell: Callable[[str], None]
+    robot: str, tokenizer: Tokenizer, stride: int, seed: int, tell: Tell
 ) -> tuple[Images, list[truth.TrueEpisode]]:
     """Return simulated episodes, and their pictures (N, S, S, 3) as the tokenizer shows them.
 
@@ -247,7 +247,7 @@ def fit(
     seed: int = 0,
     steps: int = TRAINING_STEPS,
     tee: TeeFinder | None = None,
-    tell: Callable[[str], None] = lambda words: None,
+    tell: Tell = lambda words: None,
 ) -> Probe:
     """Train a probe on pictures whose state is known.
 

@@ -12,7 +12,6 @@ The states of robots of the laboratory are simulated instead (`hma_model.evaluat
 N pictures or windows, T frames, P predicted frames, S values of a state.
 """
 
-import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -26,6 +25,7 @@ from hma_data.loading.views import Cameras
 from hma_data.shards.manifest import MANIFEST
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import mask_columns
+from hma_data.storage.files import file_sha256
 from hma_data.tokenizers.base import Tokenizer
 from hma_model.arrays import Floats, Images, Ints, evenly
 from hma_model.evaluation.intervals import NATURAL, horizon_summary, rounded
@@ -33,10 +33,8 @@ from hma_model.evaluation.kept import kept_reader
 from hma_model.evaluation.losses import episodes_of
 from hma_model.evaluation.probe import shown_episodes
 from hma_model.evaluation.rollouts import finite_frames
-from hma_model.evaluation.state_reader import UNREADABLE_SHARE, StateNetwork, outputs, resized, trained
+from hma_model.evaluation.state_reader import UNREADABLE_SHARE, StateNetwork, Tell, outputs, resized, trained
 from hma_model.generation.decode import decode
-
-Tell = Callable[[str], None]
 
 TRAINING_STEPS, LEARNING_RATE = 600, 4e-3
 IMAGE_LIMIT, EPISODES_NEEDED = 1500, 5  # most pictures to learn from, fewest episodes
@@ -212,7 +210,7 @@ def recorded_reader(
     def make() -> Reader:
         return learn(decode(tokenizer, seen.stored)[known, 0], wanted[known], seed, tell=tell)
 
-    told = hashlib.sha256((shards.folder / MANIFEST).read_bytes()).hexdigest()
+    told = file_sha256(shards.folder / MANIFEST)
     return _kept("recorded_reader", tokenizer, {"manifest": told, "cameras": cameras, "seed": seed}, make)
 
 

@@ -23,6 +23,7 @@ from hma_data.shards.recorded import Recorded
 from hma_data.storage.files import to_json, write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.arrays import Images, Ints, evenly
+from hma_model.config import token_words
 from hma_model.evaluation.losses import windows
 from hma_model.evaluation.pages import Page
 from hma_model.evaluation.plots import over_horizon
@@ -99,11 +100,6 @@ def _whose(part: Part, parts: Sequence[Part]) -> str:
     return robot if len({each.checkpoint for each in parts}) == 1 else f"{part.checkpoint}, {robot}"
 
 
-def _units(found: dict[str, Any]) -> str:
-    side = found.get("merge") or 1
-    return "tokens" if side == 1 else f"squares of {side}×{side} tokens"
-
-
 def _headline(made: Page, parts: Sequence[Part]) -> None:
     tiles = []
     for part in parts[:6]:
@@ -116,8 +112,8 @@ def _headline(made: Page, parts: Sequence[Part]) -> None:
         for path, digits, unit, about in (
             ("true.psnr_last", 1, " dB", "PSNR of the last frame"),
             ("copy.psnr_last", 1, " dB", "PSNR of a copy of the prompt's last frame"),
-            ("perplexity", 1, "", f"perplexity of a frame's {_units(found)}"),
-            ("accuracy", 2, "", f"share of {_units(found)} predicted right"),
+            ("perplexity", 1, "", f"perplexity per {token_words(found['merge'])}"),
+            ("accuracy", 2, "", f"accuracy per {token_words(found['merge'])}"),
         ):
             if (figure := value(found, path)) is not None:
                 tiles.append((f"{figure:.{digits}f}{unit}", about))

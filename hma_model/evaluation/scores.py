@@ -3,6 +3,7 @@
 B batch, P predicted frames, N windows.
 """
 
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -63,10 +64,8 @@ class Rolled:
 
     first: int
     judge: FeatureCollector
-    scores: dict[str, list[Scores]] = field(default_factory=lambda: {name: [] for name in ROLLOUT_KINDS})
-    predicted: dict[str, list[torch.Tensor]] = field(
-        default_factory=lambda: {name: [] for name in ROLLOUT_KINDS if name != "copy"}
-    )
+    scores: dict[str, list[Scores]] = field(default_factory=partial(defaultdict, list))
+    predicted: dict[str, list[torch.Tensor]] = field(default_factory=partial(defaultdict, list))
     still: int = 0
 
     def add(self, batch: Batch, roll: Callable[..., RolloutImages], draws: int, seed: int) -> None:
@@ -90,5 +89,5 @@ class Rolled:
         self.judge.add(kind, draws[0].predicted[:, self.first :])
         scores = [scores_of(pictures, self.judge.networks) for pictures in draws]
         self.scores[kind].append(combined(scores, partial(np.mean, axis=0)))
-        if kind in self.predicted:
+        if kind != "copy":
             self.predicted[kind].append(draws[0].stored)

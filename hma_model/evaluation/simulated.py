@@ -65,7 +65,8 @@ def measure_state(
         UsageError: it is no robot of the laboratory.
     """
     simulator.embodiment(robot)
-    stride = model.embodiments[robot].stride
+    space = model.embodiments[robot]
+    stride = space.stride
     probe = train_probe(robot, tokenizer, stride, seed)
     simulate = partial(truth.episode, robot, frames, stride, seed)
     made = [simulate(FIRST_EPISODE + number) for number in range(episodes)]
@@ -73,19 +74,19 @@ def measure_state(
     batch = as_batch(model, tokenizer, robot, made)
     roll = partial(rollout, model, tokenizer, prompt=prompt, seed=seed, **sampling)
     true = roll(batch)
-    copied = true.truth[:, prompt - 1 : prompt].repeat(frames - prompt, axis=1)
-    ways = {
-        "true": true.predicted[:, prompt:],
-        "shuffled": roll(shuffled(batch, prompt - 1, seed), truth=true.truth).predicted[:, prompt:],
-        "none": roll(without_actions(batch), truth=true.truth).predicted[:, prompt:],
-        "copy": copied,
-        "reconstruction": true.truth[:, prompt:],
+    films = {
+        "true": true.predicted,
+        "shuffled": roll(shuffled(batch, prompt - 1, seed), truth=true.truth).predicted,
+        "none": roll(without_actions(batch), truth=true.truth).predicted,
+        "copy": true.truth[:, prompt - 1 : prompt].repeat(frames, axis=1),
+        "reconstruction": true.truth,
     }
+    ways = {name: film[:, prompt:] for name, film in films.items()}
     parts = np.stack([one.parts[prompt:] for one in made])
     found = {"episodes": episodes, "picture_px": truth.SIZE}
     found |= _controllability(probe, ways, parts, seed)
-    wish = perturbed(chunks, model.embodiments[robot].action_dim, prompt, seed)
-    commands = wish.reshape(episodes, -1, model.embodiments[robot].action_dim)
+    wish = perturbed(chunks, space.action_dim, prompt, seed)
+    commands = wish.reshape(episodes, -1, space.action_dim)
     answers = [simulate(FIRST_EPISODE + number, commands=commands[number]) for number in range(episodes)]
     other = as_batch(model, tokenizer, robot, answers)
     return found | {"perturbed": _perturbed(model, true, roll(other), batch, other, seed)}

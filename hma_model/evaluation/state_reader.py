@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from hma_data.episodes.images import resize
 from hma_model.arrays import Floats, Images
 
+Tell = Callable[[str], None]  # is called with how far it is
 INPUT_SIDE, MAP_SIDE = 64, 32  # pixels of the images that a network sees, and cells of its maps
 CHANNELS, SHARPNESS = 16, 4.0
 POINTS, HIDDEN_WIDTH = 16, 128  # of a network for values that are no places
@@ -87,7 +88,7 @@ def trained(
     steps: int,
     rate: float,
     beta: float,
-    tell: Callable[[str], None],
+    tell: Tell,
 ) -> nn.Module:
     """Return a network trained from noisy pictures to targets (N, …), by a smooth L1 loss of that beta."""
     with torch.random.fork_rng(devices=[]):  # the caller's random numbers go on as if nothing was drawn

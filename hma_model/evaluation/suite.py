@@ -22,14 +22,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from hma_data.console import Update, progress, short_paths
+from hma_data.console import progress, short_paths
 from hma_data.errors import OutputError, UsageError
 from hma_data.lab.simulator import simulated
 from hma_data.loading.views import Cameras
 from hma_data.shards.manifest import MANIFEST
 from hma_data.shards.preview import tokenizer_of
 from hma_data.shards.reader import ShardSet
-from hma_data.storage.files import finite
+from hma_data.storage.files import file_sha256, finite
 from hma_data.storage.kept import KeptParts
 from hma_data.storage.paths import StrPath, as_path, as_text
 from hma_data.tokenizers.base import Tokenizer
@@ -112,7 +112,11 @@ def evaluate_all(
         for one in work:
             robot = one.shards.embodiment.id
             about = f"{shown[one.label]}, {robot}"
-            measured = partial(_measured, one, settings, networks, partial(_tell, update, done, about))
+
+            def tell(frames: int, what: str = "", done: int = done, about: str = about) -> None:
+                update(done + frames, f"{about}: {what}" if what else about)
+
+            measured = partial(_measured, one, settings, networks, tell)
             mark = fingerprint(one.model, one.shards, settings, networks)
             arrays = measured() if kept is None else kept.part(f"{robot}-{mark}", measured)
             part = Part.of(arrays, one.label, one.shards)
@@ -122,11 +126,6 @@ def evaluate_all(
             done += one.frames
             update(done, about)
     return parts
-
-
-def _tell(update: Update, done: int, about: str, frames: int, what: str = "") -> None:
-    """Show how many frames of a part are predicted, and what is measured that predicts none."""
-    update(done + frames, f"{about}: {what}" if what else about)
 
 
 @dataclass(frozen=True)
@@ -166,7 +165,7 @@ def fingerprint(model: HMA, shards: ShardSet, settings: EvaluationSettings, netw
         "embodiment": card.get("files"),
         "stats": card.get("stats_sha256"),
         "config": model.config.to_json(),
-        "set": hashlib.sha256((shards.folder / MANIFEST).read_bytes()).hexdigest(),
+        "set": file_sha256(shards.folder / MANIFEST),
         "settings": asdict(settings),
         "networks": networks.facts,
     }

@@ -22,6 +22,7 @@ from hma_model.arrays import Bools, Floats, Images
 from hma_model.evaluation.agreement import Accuracy, accuracy
 from hma_model.evaluation.kept import Arrays, kept, weights_sha256
 from hma_model.evaluation.probe import EPISODES, FIRST_EPISODE, Probe, as_seen, as_shown, train_probe
+from hma_model.evaluation.state_reader import Tell
 from hma_model.worlds.env import Judge
 
 Score = Callable[[Floats, int], Floats]
@@ -172,7 +173,7 @@ def train_judge(
     seed: int = 0,
     examples: int = EXAMPLES,
     probe: Probe | None = None,
-    tell: Callable[[str], None] = lambda words: None,
+    tell: Tell = lambda words: None,
 ) -> StateJudge:
     """Train a judge on recorded episodes of a laboratory robot.
 

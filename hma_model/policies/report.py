@@ -14,7 +14,7 @@ from hma_data.storage.files import write_atomic
 from hma_data.storage.kept import remove_kept
 from hma_model.evaluation.agreement import Estimate
 from hma_model.evaluation.pages import Page
-from hma_model.evaluation.plots import COLOURS, MARKERS, label_axes, svg_bytes
+from hma_model.evaluation.plots import COLOURS, MARKERS, labelled_axes, svg_bytes
 from hma_model.policies.scores import MODEL, SHARED, TRUE, WORK, Abstention, PolicyEvaluation, Scored
 
 COLUMNS = ("policy", "simulator", "model", "score, sim.", "score, model", "agree", "same actions, sim.")
@@ -223,10 +223,8 @@ def _chosen(found: PolicyEvaluation, kind: tuple[bool, bool]) -> Iterator[tuple[
 
 
 def _plot(found: PolicyEvaluation) -> bytes:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(5.6, 4.4), layout="constrained")
-    axes = figure.subplots()
+    names = "success in the simulator", "success in the model"
+    figure, axes = labelled_axes(*names, size=(5.6, 4.4))
     axes.plot([0, 1], [0, 1], color="#999999", ls=":", lw=1)
     for i, row in enumerate(found.rows()):
         x = row["true_success"]
@@ -240,5 +238,4 @@ def _plot(found: PolicyEvaluation) -> bytes:
         axes.errorbar([x], [y], xerr=bars[0], yerr=bars[1], label=row["policy"], ms=7, lw=1, **look)
     axes.set(xlim=(-0.05, 1.05), ylim=(-0.05, 1.05))
     axes.legend(frameon=False, fontsize=9)
-    label_axes(axes, "success in the simulator", "success in the model")
     return svg_bytes(figure)

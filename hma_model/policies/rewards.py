@@ -11,7 +11,7 @@ N episodes, T frames, S pixels a side, V views side by side.
 
 import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +26,7 @@ from hma_data.lab import imported
 from hma_data.shards.reader import ShardSet
 from hma_model.arrays import Bools, Floats, Images
 from hma_model.evaluation.agreement import Accuracy, accuracy, share_interval
+from hma_model.evaluation.state_reader import Tell
 from hma_model.generation.decode import cameras_for
 from hma_model.policies.lerobot import CONFIG, TASK, hub_repository, network_images
 from hma_model.worlds.env import Judge
@@ -195,7 +196,7 @@ def measured_judge(
     world: World,
     embodiment: str,
     shards: ShardSet,
-    tell: Callable[[str], None] = lambda words: None,
+    tell: Tell = lambda words: None,
 ) -> RewardJudge:
     """Load a reward model and measure it on the held-out episodes of a shard set.
 

@@ -5,6 +5,7 @@ N scenes, S pixels a side, A action dims.
 
 import copy
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -92,11 +93,8 @@ class Called:
         self._given = given
 
     def begin(self, arena: Arena) -> None:
-        made = (
-            self._given() if isinstance(self._given, type) else copy.deepcopy(self._given)
-            for _ in arena.images
-        )
-        self._functions = list(made)
+        make = self._given if isinstance(self._given, type) else partial(copy.deepcopy, self._given)
+        self._functions = [make() for _ in arena.images]
         for function in self._functions:
             if hasattr(function, "reset"):
                 function.reset()

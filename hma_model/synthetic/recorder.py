@@ -114,7 +114,7 @@ def write_shards(
         with ShardWriter(folder / unit.name, layout.schema, spec) as writer:
             for index, ref in unit.episodes:
                 one = episodes[index]
-                length = len(episodes[index].chunks)
+                length = len(one.chunks)
                 times = np.arange(length) / own.effective_hz
                 rows.append(
                     EpisodeRow(
