@@ -1,8 +1,8 @@
 """Decide whether a model follows its actions: one rule for every command, page and card.
 
 The measure is the PSNR gain of a rollout's last frame, recorded vs shuffled actions. A model follows its
-actions if the mean gain is FOLLOWS_DB or more and its 95 % interval lies above 0. The interval is over
-held-out episodes, so one episode gives no verdict.
+actions if the mean gain is FOLLOWS_DB or more and its 95 % interval lies above 0. It does not if the interval
+ends below FOLLOWS_DB. The interval is over held-out episodes, so one episode gives no verdict.
 """
 
 from collections.abc import Mapping
@@ -31,7 +31,8 @@ def verdict(found: Mapping[str, Any]) -> str:
     said = _measured(found)
     if follows(found):
         return f"follows its actions: {said}"
-    if found["psnr_action_gain_last"] >= FOLLOWS_DB:
+    ends = found.get("psnr_action_gain_last_95")
+    if not ends or max(found["psnr_action_gain_last"], ends[1]) >= FOLLOWS_DB:  # the gain may be as large
         return f"may follow its actions (inconclusive): {said}"
     loss, shuffled_loss = found.get("loss"), found.get("shuffled_loss")
     if loss and shuffled_loss and shuffled_loss >= SENSITIVE * loss:

@@ -334,6 +334,9 @@ def test_no_model_follows_without_an_interval_above_zero() -> None:
     assert "(95 % CI -2.6 to +8.8)" in verdict(wide) and verdict(wide).endswith("only 3 held-out episodes")
     one = GAIN | {"psnr_action_gain_last_95": None, "episodes": 1}
     assert not follows(one) and verdict(one).startswith("may follow its actions (inconclusive): ")
+    for ends in (None, [-3.0, 6.0]):  # the gain may be large, or not
+        few = NO_GAIN | {"psnr_action_gain_last_95": ends}
+        assert verdict(few).startswith("may follow its actions (inconclusive): ")
     assert "+2.1 dB (no CI)" in verdict(one) and verdict(one).endswith("only 1 held-out episode")
 
 
