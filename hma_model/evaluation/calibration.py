@@ -69,8 +69,9 @@ class Meter:
         """Return the meter of the values of `facts`; KeyError, TypeError or ValueError if they are none."""
         own = {name: facts[name] for name in cls.__dataclass_fields__}
         curve = np.array([own["stated"], own["error_px"]], np.float64)
-        rates = [own[name] or 0 for name in ("misses", "false_alarms")]
-        numbers = np.array([own["limit"], own["doubled_px"], own["right"], own["clock"], *rates], np.float64)
+        own |= {name: float(own[name]) for name in ("temperature", "limit", "doubled_px", "right", "clock")}
+        own |= {name: own[name] and float(own[name]) for name in ("misses", "false_alarms")}
+        numbers = [value for value in own.values() if isinstance(value, float)]
         sound = np.isfinite(curve).all() and np.isfinite(numbers).all() and (np.diff(curve) >= 0).all()
         if not (sound and curve.size):
             raise ValueError(f"no meter: {dict(facts)}")

@@ -170,6 +170,7 @@ def test_a_card_gives_a_meter_for_the_frames_that_it_was_measured_on_or_says_why
     assert "hma benchmark calibrates it" in meter_of(tokens, {}, *way)[1]
     broken: tuple[dict[str, Any], ...] = (
         {"limit": "x"},
+        {"temperature": "hot"},
         {"stated": ["a", "b"]},
         {"error_px": [1.0]},
         {"right": np.nan},
