@@ -4,7 +4,6 @@ A mean over sets counts each set once; its interval is that of the mean. The mea
 mean loss.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
@@ -14,7 +13,7 @@ from hma_data.console import human_count, short_paths
 from hma_data.storage.files import finite
 from hma_data.tables import Table
 from hma_model.evaluation.intervals import ANY, NATURAL, SHARE, over_datasets
-from hma_model.evaluation.metrics import PSNR_GAIN_RANGE, PSNR_RANGE, SSIM_RANGE
+from hma_model.evaluation.metrics import PSNR_GAIN_RANGE, PSNR_RANGE, SSIM_RANGE, perplexity
 from hma_model.evaluation.suite import Part
 from hma_model.evaluation.verdict import verdict
 
@@ -152,7 +151,7 @@ def means(parts: Sequence[Part]) -> list[dict[str, Any]]:
             episodes = [part.by_window["episode"] for part in own]
             values = [part.by_window[figure.by_window] for part in own]
             mean, ends = over_datasets(values, episodes=episodes, within=figure.within)
-            scaled = math.exp if figure.exponential else float
+            scaled = perplexity if figure.exponential else float
             row[figure.path] = round(scaled(mean), 4)
             row[f"{figure.path}_95"] = ends and [round(scaled(end), 4) for end in ends]
         found.append(row)

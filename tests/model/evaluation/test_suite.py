@@ -20,7 +20,7 @@ from hma_model.cli import main
 from hma_model.evaluation import report, suite
 from hma_model.evaluation.report import difference, write_results
 from hma_model.evaluation.simulated import PERTURBATION, perturbed
-from hma_model.evaluation.suite import EvaluationSettings, evaluate_all
+from hma_model.evaluation.suite import EvaluationSettings, Part, evaluate_all
 from hma_model.evaluation.tables import MEAN, absences, comparison, means
 from hma_model.evaluation.verdict import verdict
 from tests.model.robots import CONFIG, SPEC, Blocks, make_model, save
@@ -85,6 +85,12 @@ def test_every_checkpoint_is_evaluated_on_every_set_and_the_mean_counts_sets_onc
     assert [line[1] for line in lines] == ["arm", "hand", "mean over sets"] * 2 and len(lines[0]) == len(
         names
     )
+
+
+def test_a_loss_too_large_for_a_perplexity_is_no_error() -> None:
+    found = {"embodiment": "arm", "windows": 2, "episodes": 2, "perplexity": 1e300}
+    parts = [Part("run", "set", found, {"loss": np.array([700.0, 820.0]), "episode": np.arange(2)}, {})]
+    assert means(parts)[0]["perplexity"] == np.inf
 
 
 def test_a_verdict_reaches_the_cards_of_a_checkpoint(made: Path, evaluated: list[suite.Part]) -> None:
