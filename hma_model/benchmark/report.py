@@ -200,7 +200,7 @@ def read_results(path: Path) -> dict[str, Any]:
     found = run.read_results(path)
     try:
         compared(found, found)
-    except (KeyError, TypeError, ValueError, AttributeError) as fault:
+    except (ArithmeticError, LookupError, TypeError, ValueError, AttributeError) as fault:
         raise OutputError(path, f"lacks figures ({type(fault).__name__}: {fault})", run.REMEDY) from fault
     return found
 

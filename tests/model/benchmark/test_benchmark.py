@@ -232,9 +232,11 @@ def test_damaged_results_are_refused_with_what_to_do(folders: tuple[Path, Path],
         read_results(tmp_path)
     path.write_text(json.dumps({key: value for key, value in json.loads(whole).items() if key != "sha256"}))
     assert read_results(path) == read_results(folders[0])  # of an older version
-    path.write_text('{"benchmark": "hma-benchmark", "measures": {"a": 1}}')
-    with pytest.raises(OutputError, match="lacks figures"):
-        read_results(path)
+    without: dict[str, Any] = json.loads(whole) | {"sha256": None}
+    for figures in ({"psnr": 1, "psnr_95": [1.0]}, {"psnr": 10**400}, 1):
+        path.write_text(json.dumps(without | {"measures": dict.fromkeys(without["measures"], figures)}))
+        with pytest.raises(OutputError, match="lacks figures"):
+            read_results(path)
 
 
 def test_finished_results_of_a_killed_job_still_record_meters_and_remove_its_parts(
