@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.errors import UsageError
+from hma_data.errors import EpisodeError, UsageError
 from hma_data.loading.views import Cameras, Views, view_count
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import MANIFEST
@@ -34,6 +34,7 @@ from hma_model.worlds.prompts import SeenShards
 from hma_model.worlds.world import World
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
+MOST_REPEATS = 100  # of a video's frames, in the mean; a video of more has a wrong clock
 DECODED = 64  # frames of a video that are decoded at a time
 RATE_TOLERANCE = 0.1  # share by which the film's rate may differ from the model's
 
@@ -175,8 +176,11 @@ def _video_episodes(
     if robot is not None:
         robot = _seen_by(robot, trained_cameras(card(world.model, embodiment)))
     found = []
+    names = set[str]()
     for file in files:
         name = str(file.relative_to(folder).with_suffix(""))
+        name += file.suffix * (name in names)  # of a video that differs from another one by its suffix alone
+        names.add(name)
         try:
             content = file_sha256(file)
         except OSError as fault:  # it goes to quarantine when it is read
@@ -189,6 +193,9 @@ def _video_episodes(
 def _encoded_video(world: World, file: Path, robot: Embodiment | None, hz: float) -> NDArray[Any]:
     """Return the frames of a video that are nearest to the ticks of a clock, as shards store them."""
     times = frame_table(file).times
+    seconds = times[-1] - times[0]
+    if seconds * hz > MOST_REPEATS * len(times):
+        raise EpisodeError(file, f"has {len(times)} frames in {seconds:,.0f} s", "correct their times")
     ticks = np.arange(times[0], times[-1] + 1e-6, 1 / hz)
     nearest = np.searchsorted((times[1:] + times[:-1]) / 2, ticks)
     video = VideoFile(file)

@@ -40,6 +40,7 @@ from hma_model.worlds.world import World, load_world
 WORK = ".label"
 ORIGIN = "inferred: the actions are a model's, by inverse dynamics from the frames"
 BATCH_WINDOWS = 16  # windows of a pass
+Labelling = Callable[[float, str, float], None]  # episodes done, what is done, episodes in all
 MAX_CHECKED = 64  # labelled episodes that the error is measured on, at most
 
 
@@ -91,7 +92,7 @@ def label_actions(
     check: StrPath | None = None,
     world: World | None = None,
     device: str = "cpu",
-    on_progress: Callable[[float, str, float], None] = lambda done, words, total: None,
+    on_progress: Labelling = lambda done, words, total: None,
 ) -> Labelled:
     """Infer the actions of film, and write a shard set of the robot.
 
@@ -174,7 +175,7 @@ def measure(
     world: World,
     spec: Commands,
     shards: ShardSet,
-    on_progress: Callable[[float, str, float], None] = lambda done, words, total: None,
+    on_progress: Labelling = lambda done, words, total: None,
 ) -> LabelError:
     """Return the error of inferred actions on labelled shards.
 
@@ -185,8 +186,7 @@ def measure(
     split = "val" if film.numbers("val") else "train"
     numbers = film.numbers(split)[:MAX_CHECKED]
     width = len(spec.names)
-    misses = list[Float32s]()
-    true = list[Float32s]()
+    pairs = list[Float32s]()  # (2, n, A): errors, and true values
     for done, number in enumerate(numbers):
         on_progress(done, "checking on labelled video", len(numbers))
         stored, actions, known = film.labelled(number)
@@ -194,14 +194,12 @@ def measure(
             continue
         # The last frame has a chunk after it, but no frame to which it led.
         chunks = actions[:-1]
-        compared = known[:-1]
-        miss = infer(world.model, spec, stored) - chunks
-        misses.append(miss[compared].reshape(-1, width))
-        true.append(chunks[compared].reshape(-1, width))
-    if not sum(map(len, true)):
+        both = np.stack([infer(world.model, spec, stored) - chunks, chunks])
+        pairs.append(both[:, known[:-1]].reshape(2, -1, width))
+    if not any(both.size for both in pairs):
         raise HMAError(shards.folder, "has no known actions to compare with", "name labelled shards")
-    values = np.concatenate(true).astype(np.float64)
-    rmse = np.sqrt(np.square(np.concatenate(misses).astype(np.float64)).mean(axis=0))
+    misses, values = np.concatenate(pairs, axis=1).astype(np.float64)
+    rmse = np.sqrt(np.square(misses).mean(axis=0))
     robot = yaml_of(world.model, spec.embodiment)
     units = [part.unit or "" for part in robot.action.components for _ in range(part.dims)]
     names = tuple(f"{name} {unit}".strip() for name, unit in zip(spec.names, units, strict=True))
@@ -234,25 +232,21 @@ def _label(
     spec: Commands,
     film: Sequence[FilmEpisode],
     kept: KeptParts,
-    on_progress: Callable[[float, str, float], None],
+    on_progress: Labelling,
 ) -> "tuple[_Labelled, list[Refused]]":
     """Infer the actions of all episodes that are not kept yet."""
     usable = list[FilmEpisode]()
     refused = list[Refused]()
     for number, episode in enumerate(film):
         on_progress(number, "labelling", len(film))
-        found = kept.part(_part(episode), partial(_labels_of, model, spec, episode))
+        # Kept by its content, so film may be added between runs.
+        found = kept.part(episode.key[:32], partial(_labels_of, model, spec, episode))
         if "fault" in found:
             refused.append(Refused(episode.id, EpisodeError.__name__, str(found["fault"])))
         else:
             usable.append(episode)
     on_progress(len(film), "labelling", len(film))
     return _Labelled(kept, usable), refused
-
-
-def _part(episode: FilmEpisode) -> str:
-    """Return the name under which an episode is kept: by its content, so film may be added between runs."""
-    return episode.key[:32]
 
 
 def _labels_of(model: HMA, spec: Commands, episode: FilmEpisode) -> dict[str, NDArray[Any]]:
@@ -278,7 +272,7 @@ class _Labelled(Sequence[SyntheticEpisode]):
 
     def __getitem__(self, number: Any) -> Any:
         episode = self._film[number]
-        with np.load(self._kept.path(_part(episode))) as arrays:
+        with np.load(self._kept.path(episode.key[:32])) as arrays:
             stored = arrays["stored"]
             chunks = arrays["chunks"]
         counts = {"inferred_actions": len(chunks)}

@@ -2,6 +2,7 @@
 
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import torch
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.episodes.sheets import write_mp4
-from hma_data.errors import HMAError, OutputError, UsageError
+from hma_data.errors import EpisodeError, HMAError, OutputError, UsageError
 from hma_data.lab import family, record
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import EpisodeReader, ShardSet
@@ -20,6 +21,7 @@ from hma_data.shards.verify import verify
 from hma_data.tokenizers.base import get_tokenizer
 from hma_model.generation import commands as generation_commands
 from hma_model.simulate import World, read_prompt
+from hma_model.synthetic import film as film_module
 from hma_model.synthetic import labels
 from hma_model.synthetic.film import ShardFilm, _seen_by, read_film
 from hma_model.synthetic.labels import infer, label_actions
@@ -166,6 +168,16 @@ def test_video_files_are_taken_at_the_rate_of_the_model(world: World, tmp_path: 
     assert (found.id, found.group, found.instruction) == ("long", "", "")
     shown = world.tokenizer.decode(found.frames()).mean(axis=(1, 2, 3))
     assert len(shown) == 10 and np.abs(shown - levels[::3]).max() < 12
+    shutil.copy(tmp_path / "long.mp4", tmp_path / "long.mov")
+    assert [one.id for one in read_film(world, tmp_path, ROBOT, 10.0)] == ["long", "long.mp4"]
+
+
+def test_a_video_whose_clock_jumps_is_refused(world: World, tmp_path: Path, monkeypatch) -> None:
+    film(tmp_path)
+    monkeypatch.setattr(film_module, "frame_table", lambda file: SimpleNamespace(times=np.array([0.0, 1e6])))
+    (found,) = read_film(world, tmp_path, ROBOT, 10.0)
+    with pytest.raises(EpisodeError, match="has 2 frames in 1,000,000 s"):
+        found.frames()
 
 
 @pytest.mark.slow
