@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.episodes.images import resize
-from hma_data.errors import HMAError
+from hma_data.errors import HMAError, UsageError
 from hma_data.lab import FAMILY, truth
 from hma_data.lab.scripted import PUSHER, SceneState, SeenState, seen_state, state_of, steerable
 from hma_data.lab.simulator import LabSimulator, simulated
@@ -58,6 +58,10 @@ class Scenes:
         """
         found = described(world.model, embodiment)
         spec = world.action_spec(embodiment)
+        if simulator and (views := world.model.config.views) > 1:
+            fault = f"the simulator shows one camera, and the model sees {views}"
+            remedy = "give a model of one camera, or a reward model as --judge with --from SHARDS"
+            raise UsageError(embodiment, fault, remedy)
         if simulator and not simulated(embodiment):
             remedy = "choose one of the toolkit's robots, or judge by a reward model: --judge FOLDER_OR_REPO"
             raise HMAError(embodiment, "has no simulator to compare with", remedy)

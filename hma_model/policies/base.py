@@ -115,6 +115,6 @@ def _named_errors(name: str) -> Iterator[None]:
         yield
     except HMAError:
         raise
-    except Exception as fault:
+    except (Exception, SystemExit) as fault:
         remedy = "fix it; --debug shows the traceback"
         raise HMAError(f"policy {name}", f"raised {type(fault).__name__}: {fault}", remedy) from fault

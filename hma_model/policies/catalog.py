@@ -66,7 +66,7 @@ def _named(words: str) -> Any:
     sys.path.insert(0, here)
     try:
         return pkgutil.resolve_name(words)
-    except Exception as fault:
+    except (Exception, SystemExit) as fault:  # a script may exit where it is imported
         remedy = POLICY_FORMS
         if isinstance(fault, ModuleNotFoundError) and fault.name == module.partition(".")[0]:
             remedy = f"run hma in the folder of {fault.name}.py, or install its package"

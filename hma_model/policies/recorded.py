@@ -89,12 +89,13 @@ class ModelEvaluation:
     policies: tuple[Played, ...]
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return the figures of each policy."""
+        """Return the figures of each policy; intervals count each beginning once."""
+        count = self.beginnings
         return [
             {
                 "policy": one.policy,
                 "model_success": float(one.success.mean()),
-                "model_success_interval": share_interval(int(one.success.sum()), one.success.size),
+                "model_success_interval": share_interval(round(one.success.mean() * count), count),
                 "model_score": float(one.scores.mean()),
             }
             for one in self.policies
@@ -115,10 +116,10 @@ class ModelEvaluation:
 
     def sentences(self) -> list[str]:
         """Return in words what the table means."""
-        pairs = alike_pairs(np.stack([one.success for one in self.policies]))
+        pairs = alike_pairs(np.stack([one.success[: self.beginnings] for one in self.policies]))
         names = [f"{self.policies[one].policy} and {self.policies[other].policy}" for one, other in pairs]
         alike = [f"not distinguishable by success: {'; '.join(names)}"] if names else []
-        success = "success: the judge scores some frame above 0.5; 95 % intervals over episodes"
+        success = "success: the judge scores some frame above 0.5; 95 % intervals over recorded starts"
         return [success, self.judge.sentence, UNKNOWN, *alike]
 
     def table(self) -> list[list[Any]]:
@@ -171,8 +172,8 @@ def evaluate_recorded(
         for name, policy in zip(names, made, strict=True):
             _try(name, policy, world, begun)
         digest = hashlib.sha256(labelled.manifest.to_text().encode()).hexdigest()
-        judged_by: dict[str, Any] = {"shards_sha256": digest, "judge": judge}
-        judged_by |= {"judge_sha256": policy_facts(f"lerobot:{judge}", embodiment)}
+        files = policy_facts(f"lerobot:{judge}", embodiment)
+        judged_by = {"shards_sha256": digest, "judge": judge, "judge_sha256": files}
         kept = kept_policies(folder, world, scenes, frames, judged_by)
         keys = part_keys(policies, world, embodiment, judge) if folder else names
         play = partial(_play, world=world, begun=begun, judge=measured, frames=frames)

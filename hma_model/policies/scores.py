@@ -21,7 +21,7 @@ import json
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import closing, nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -164,8 +164,10 @@ class PolicyEvaluation:
         policies can differ in the model and in the simulator for other reasons than what they did.
         """
         judged = self.generated
-        if judged.too_few:
-            return f"there are too few {judged.too_few} to tell whether the judge is better than chance"
+        outcomes = np.stack([one.success[REPLAYED] for one in self.policies])
+        scenes = [int(part.any(axis=0).sum()) for part in (outcomes, ~outcomes)]  # policies share them
+        if few := replace(judged, count=sum(scenes), successes=scenes[0]).too_few:
+            return f"there are too few scenes with {few} to tell whether the judge is better than chance"
         if not judged.better_than_chance:
             if judged.high is not None and judged.high >= GOOD_ACCURACY:
                 return "the judge may be no better than chance; more episodes would tell"
@@ -296,12 +298,14 @@ def evaluate_policies(
         each = play_all(names, made, keys, kept, frames * episodes, on_progress, score)
         scored = [Scored(name, **arrays) for name, arrays in zip(names, each, strict=True)]
     success = np.stack([one.success for one in scored], axis=1)  # (3, M, N)
-    rates = success.astype(float)
     scores = np.stack([one.scores for one in scored], axis=1)
+    by_success, by_score = (
+        correlations(one[TRUE], one[MODEL], seed) | {"mmrv": mmrv(one[TRUE], one[MODEL], seed)}
+        for one in (success.astype(float), scores)
+    )
     judged = success[MODEL].ravel()
     replayed = success[REPLAYED].ravel()
     precision, recall = precision_recall(success[TRUE].ravel(), judged)
-    paired = auroc(success[TRUE], scores[MODEL], seed)
     return PolicyEvaluation(
         embodiment,
         str(checkpoint),
@@ -310,13 +314,13 @@ def evaluate_policies(
         frames,
         judge,
         tuple(scored),
-        correlations(rates[TRUE], rates[MODEL], seed) | {"mmrv": mmrv(rates[TRUE], rates[MODEL], seed)},
-        correlations(scores[TRUE], scores[MODEL], seed) | {"mmrv": mmrv(scores[TRUE], scores[MODEL], seed)},
+        by_success,
+        by_score,
         accuracy(replayed, judged),
         *precision_recall(replayed, judged),
         episode_correlation(scores[MODEL].ravel(), scores[REPLAYED].ravel()),
         auroc(success[REPLAYED], scores[MODEL], seed),
-        {"precision": precision, "recall": recall, "auroc": paired},
+        {"precision": precision, "recall": recall, "auroc": auroc(success[TRUE], scores[MODEL], seed)},
         None if meter is None or max_error is None else Abstention.of(meter, max_error, scored),
     )
 

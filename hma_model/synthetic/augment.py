@@ -33,11 +33,12 @@ from hma_model.arrays import Bools, Float32s, Floats
 from hma_model.evaluation.calibration import Meter, accumulated
 from hma_model.evaluation.probe import Probe, train_probe
 from hma_model.evaluation.recorded_state import EPISODES_NEEDED, Reader, recorded_reader, simulated_reader
+from hma_model.evaluation.state_reader import Tell
 from hma_model.generation.decode import cameras_for
 from hma_model.policies.arenas import Arena, Beginning, ModelArena, Scenes, TrueArena
 from hma_model.policies.base import Judged, Policy
 from hma_model.policies.catalog import read_policy
-from hma_model.policies.fingerprints import device_facts, world_digests
+from hma_model.policies.fingerprints import device_facts, policy_facts, world_digests
 from hma_model.policies.judge import StateJudge, task_of, train_judge
 from hma_model.policies.rewards import RewardModel, labelled_shards, measured_judge, names_reward_model
 from hma_model.policies.scores import Progress, choosing_meter, run
@@ -189,8 +190,9 @@ def augment(
             is no better than chance, or no episode is left.
     """
     folder = as_path(out)
-    if lerobot is not None:
-        require_dataset(as_path(lerobot))
+    dataset = None if lerobot is None else as_path(lerobot)
+    if dataset is not None:
+        require_dataset(dataset)
     world = world or load_world(
         checkpoint, [settings.embodiment], unmask_steps=settings.unmask_steps,
         temperature=settings.temperature, precision=settings.precision, **given,
@@ -198,22 +200,19 @@ def augment(
     meter = None if settings.max_error is None else choosing_meter(world, settings.embodiment)
     if settings.keep < 1 and meter is None:
         _warn_of_choice(world, settings)
-    if (views := world.model.config.views) > 1 and (shards is None or settings.looked_at):
-        fault = f"the simulator shows one camera, and the model sees {views}"
-        remedy = "name shards with --from, and leave out --judge and policies that read the robot's state"
-        raise UsageError("augment", fault, remedy)
     made_by = {"by": "hma augment", "synthetic": True, **asdict(settings)}
     made_by |= {"precision": world.precision} | world_digests(world, settings.embodiment)
     begins = None if shards is None else ShardSet(shards)
     if begins is not None:
         made_by["source_sha256"] = hashlib.sha256(begins.manifest.to_text().encode()).hexdigest()
-    dataset = None if lerobot is None else as_path(lerobot)
     with locked(folder):
         done = dataset is None or holds_dataset(dataset, made_by)  # before anything is made
         found = finished(folder, made_by)
         if found is None:
             maker = _Maker(world, settings, begins)
-            kept = KeptParts(folder / WORK, made_by | device_facts(world.model))
+            asked = settings.commands, f"lerobot:{settings.judge}"  # their files may change in between
+            files = {"files": [policy_facts(words, settings.embodiment) for words in asked]}
+            kept = KeptParts(folder / WORK, made_by | device_facts(world.model) | files)
             batches = maker.run(kept, on_progress)
             spec = world.tokenizer.spec
             chosen = _chosen(batches, settings, UNCERTAINTY_FLAGS[spec.kind], meter)
@@ -245,7 +244,7 @@ def _stated(
     settings: Augmentation,
     shards: ShardSet | None,
     cameras: Sequence[str],
-    tell: Callable[[str], None],
+    tell: Tell,
 ) -> tuple[Embodiment, Reader] | None:
     """Return the real robot, and what reads its state off images; None if no state is known."""
     if shards is None:
@@ -268,7 +267,8 @@ class _Maker:
         self.shards = shards
         name = settings.embodiment
         self.prompt_frames = default_frames(world.model)
-        self.scenes = Scenes.of(world, name, settings.episodes, settings.seed, simulator=shards is None)
+        simulator = shards is None or settings.looked_at
+        self.scenes = Scenes.of(world, name, settings.episodes, settings.seed, simulator=simulator)
         self.robot: Embodiment = self.scenes.robot.embodiment
         self.policy = self._policy(settings.commands)
         self.judge: StateJudge | RewardModel | None = None
@@ -394,14 +394,11 @@ class _Maker:
         """Return beginnings from episodes of shards, with their actions."""
         scenes = self.scenes.take(numbers)
         known = self.prompt_frames
-        prompts = []
-        told = []
-        groups = []
-        for number in numbers:
-            row, (frames, chunks) = self._window(shards, number)
-            prompts.append(Prompt(frames[:known], chunks[: known - 1]))
-            told.append(np.nan_to_num(chunks[known - 1 :]).reshape(-1, len(scenes.dimensions)))
-            groups.append(str(row["group"] or row["id"]))
+        rows, windows = zip(*(self._window(shards, number) for number in numbers), strict=True)
+        prompts = [Prompt(frames[:known], chunks[: known - 1]) for frames, chunks in windows]
+        dims = len(scenes.dimensions)
+        told = [np.nan_to_num(chunks[known - 1 :]).reshape(-1, dims) for _, chunks in windows]
+        groups = [str(row["group"] or row["id"]) for row in rows]
         steps = list(np.stack(told, axis=1).astype(np.float32))
         return Beginning(scenes, prompts, at_rest(scenes.dimensions, steps[0]), steps, groups)
 
@@ -454,7 +451,6 @@ def _chosen(
         fault = f"none of the {chosen.sum()} least uncertain of {len(unsure)} episodes is judged a success"
         raise HMAError("augment", fault, "make more episodes, keep more, or leave out the judge")
     chosen &= success
-    judged = True if settings.judge else None
     made = chain.from_iterable(zip(one.stored, one.chunks, one.groups, strict=True) for one in batches)
     found = []
     for number, (stored, chunks, group) in enumerate(made):
@@ -467,5 +463,5 @@ def _chosen(
         if measured:
             counts[measure] = round(1000 * float(unsure[number]))
         name = f"synthetic_{number:06d}"
-        found.append(SyntheticEpisode(name, stored, chunks, counts, str(group), judged))
+        found.append(SyntheticEpisode(name, stored, chunks, counts, str(group), bool(settings.judge) or None))
     return found

@@ -7,6 +7,7 @@ import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ from hma_model.policies.arenas import ModelArena, Scenes, TrueArena
 from hma_model.policies.base import begin, checked
 from hma_model.policies.catalog import read_policy
 from hma_model.policies.judge import StateJudge, task_of
+from hma_model.policies.recorded import ModelEvaluation, Played
 from hma_model.policies.report import html, sentences, write_report
 from hma_model.policies.scores import (
     MODEL,
@@ -112,10 +114,9 @@ def test_in_a_world_without_error_both_scores_agree(world: World, judge: StateJu
     assert np.array_equal(found.policies[2].true_images, found.policies[2].model_images)
     assert found.policies[3].scores[TRUE].max() == 0 and found.policies[0].scores[TRUE].max() > 2
     assert found.generated.balanced == 1 and found.followed.value == pytest.approx(1)
-    assert found.precision.value == found.recall.value == 1 and found.refusal == ""
-    (reason,) = [one for one in sentences(found) if "success rates over policies" in one]
-    assert found.success["pearson"].value is None
-    assert reason.endswith("no correlation: 4 of at least 8 episodes")
+    assert found.precision.value == found.recall.value == 1
+    assert "too few scenes with successes" in found.refusal  # of four scenes
+    assert found.success["pearson"].reason == "4 of at least 8 episodes"
 
 
 def test_policies_of_gym_pusht_are_told_where_the_disc_is(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,11 +148,11 @@ def test_a_model_is_scored_and_the_report_written(world: World, judge: StateJudg
     assert json.loads((tmp_path / "out" / "results.json").read_text())["policies"][0]["policy"] == "random"
 
 
-def test_shares_have_exact_intervals_and_too_few_successes_are_said(still: PolicyEvaluation) -> None:
+def test_shares_have_exact_intervals_and_too_few_successes_are_said(still: PolicyEvaluation, judge) -> None:
     found = still
     (row,) = found.rows()
     assert row["true_success"] == 0 and row["true_success_interval"] == pytest.approx((0, 0.369), abs=1e-3)
-    doubt = "there are too few successes to tell whether the judge is better"
+    doubt = "there are too few scenes with successes to tell whether the judge is better"
     assert any(doubt in sentence for sentence in sentences(found))
     page = html(found)
     assert page.count(doubt) == 1 and page.index(doubt) < page.index("<table")
@@ -160,7 +161,8 @@ def test_shares_have_exact_intervals_and_too_few_successes_are_said(still: Polic
         (0.9, "may be no better than chance; more"),
     ):
         generated = Accuracy(0.5, 0.4, high, share=0.5, count=32, successes=4)
-        assert said in replace(found, generated=generated).refusal
+        half = np.where(np.arange(24) < 12, 8.0, 2.0)
+        assert said in replace(evaluation(judge, [scored_as("p", half, half)]), generated=generated).refusal
 
 
 METER = Meter(2, 0.0, (0.0, 8.0), (1.0, 17.0), 2.0, 3.0, 0.8, 0.5, 0.1, 0.1, better=True, chooses=True)
@@ -207,6 +209,21 @@ def test_no_verdict_where_single_episodes_do_not_agree(judge: StateJudge) -> Non
     page = html(wrong)
     assert page.index("no verdict" if "no verdict" in page else "No verdict") < page.index("<table")
     assert "correlation of success rates" not in page and "correlation of success rates" in html(found)
+
+
+def test_many_policies_in_one_scene_are_no_verdict(judge: StateJudge) -> None:
+    made = [scored_as(f"p{n}", np.array([2.0 + n]), np.array([2.0 + n]), 7.0) for n in range(10)]
+    found = evaluation(judge, made, episodes=1)
+    assert found.generated.better_than_chance and "too few scenes with successes" in found.refusal
+
+
+def test_episodes_that_begin_alike_count_once() -> None:
+    images, judged = np.zeros((32, 1, 8, 8, 3), np.uint8), np.ones(32, np.bool_)
+    every: Any = [Played(name, made * 1.0, made, images) for name, made in (("a", judged), ("b", ~judged))]
+    known: Any = SimpleNamespace(sentence="")
+    found = ModelEvaluation("arm", "run", "", 0, 4, 2, known, tuple(every))
+    assert found.rows()[0]["model_success_interval"] == pytest.approx((0.158, 1), abs=1e-3)
+    assert "not distinguishable by success: a and b" in found.sentences()
 
 
 def test_a_model_abstains_where_it_expects_a_large_error_of_its_own(judge, monkeypatch) -> None:
@@ -438,18 +455,33 @@ def test_a_module_that_is_not_there_is_said_with_where_it_is_looked_for(world: W
         read_policy("nowhere:policy", Scenes.of(world, ROBOT, 1, 0))
 
 
+def test_a_module_or_policy_that_exits_is_an_error(world: World, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "leaves.py").write_text("raise SystemExit(0)")
+    scenes = Scenes.of(world, ROBOT, 1, 0)
+    with pytest.raises(HMAError, match="leaves:act: cannot be imported: SystemExit"):
+        read_policy("leaves:act", scenes)
+    arena, policy = TrueArena(scenes, 128), Called(sys.exit)
+    begin("it", policy, arena)
+    with pytest.raises(HMAError, match="policy it: raised SystemExit"):
+        checked("it", policy, arena)
+
+
 @pytest.mark.parametrize("words", ["fly", "scripted:noise=2", "scripted:speed=1"])
 def test_words_that_are_no_policy_are_refused(world: World, words: str) -> None:
     with pytest.raises(UsageError, match="is unknown"):
         read_policy(words, Scenes.of(world, ROBOT, 1, 0))
 
 
-def test_a_robot_without_a_simulator_is_refused() -> None:
+def test_a_robot_without_a_simulator_or_with_several_cameras_is_refused(world: World, monkeypatch) -> None:
     from hma_model.cli import app
     from tests.model.robots import make_model
 
     with pytest.raises(HMAError, match="arm: has no simulator to compare"):
         Scenes.of(_world_of(make_model({"arm": 2})), "arm", 1, 0)
+    monkeypatch.setattr(world.model, "config", world.model.config.replace(views=2))
+    with pytest.raises(UsageError, match="rails_03: the simulator shows one camera, and the model sees 2"):
+        evaluate_policies(ROBOT, ["still"], world=world)
     assert "POLICY" in CliRunner().invoke(app, ["policy-eval", "--help"]).output
 
 

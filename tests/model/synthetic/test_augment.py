@@ -1,6 +1,7 @@
 """Synthetic episodes: shards that verify and say what they are, replays, resumption, LeRobotDatasets."""
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ from tests.data import cameras as three
 from tests.model.shards import state_pauses
 from tests.model.true_world import BlockLatents, latent_model, trained_on
 
+BATCHES = augment_module._chosen
 ROBOT, FRAMES, KNOWN = "rails_03", 4, 2
 
 
@@ -285,6 +287,24 @@ def test_other_shards_of_the_same_name_are_not_the_same_job(world: World, real: 
     convert(family.embodiment(ROBOT), recording, world.tokenizer, tmp_path / "other" / "real")
     with pytest.raises(OutputError, match="holds another shard set"):
         augment(tmp_path / "out", settings, world=world, shards=tmp_path / "other" / "real")
+
+
+@pytest.mark.slow
+def test_a_policy_that_was_edited_does_not_continue_a_job(world, tmp_path, monkeypatch) -> None:
+    def run(value: int, batches: Any = BATCHES) -> None:
+        sys.modules.pop("moves", None)
+        (tmp_path / "moves.py").write_text(f"act = lambda image: [{value}, 0]")
+        monkeypatch.setattr(augment_module, "_chosen", batches)
+        augment(tmp_path / "out", asked(commands="moves:act"), world=world)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    with pytest.raises(TypeError):
+        run(1, None)  # stopped when all episodes are made
+    with pytest.raises(OutputError, match="was started with other settings"):
+        run(2)
+    run(1)
+    sys.modules.pop("moves")
 
 
 def test_episodes_of_several_cameras_hold_each_in_its_place(tmp_path, monkeypatch) -> None:
