@@ -35,7 +35,7 @@ def main() -> None:
     for name, robot in robots.items():
         if robot.source == "simulator":
             sessions[name] = [
-                Session(name, robot, n, world, world.decoding, 0.0) for n in range(given.scenes)
+                Session(name, robot, n, robot.scene(n), world, world.decoding) for n in range(given.scenes)
             ]
     every = [session for some in sessions.values() for session in some]
     for session in every:
