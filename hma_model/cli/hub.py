@@ -73,7 +73,7 @@ def push(
     for name, card in opened.cards(embodiment).items():
         judged = card.get("evaluation")
         if value_of(judged, "follows") is False:
-            say(f"{name} {_cell(judged.get('verdict'), 400)}; the model card starts with this verdict")
+            say(f"{name} {_cell(value_of(judged, 'verdict'), 400)}; the model card starts with this verdict")
     robots = "".join(f" -e {shlex.quote(name)}" for name in embodiment or ())
     say(f"fetch it: hma hub pull {shlex.quote(target)}{robots} --out {_folder_for(target)}")
 

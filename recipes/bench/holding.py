@@ -3,7 +3,8 @@
     python recipes/bench/holding.py embedded-lab          # into hma_model/play/holding.json
 
 Each robot with a simulator replays the recorder's actions in the model until model and truth have parted
-(`hma_model.play.session`), in several scenes. The lower median over scenes is the time that it holds.
+(`hma_model.play.session`), in several scenes; one without replays held-out recordings of --shards, to their
+end. The lower median over scenes is the time that it holds.
 """
 
 import argparse
@@ -12,6 +13,7 @@ import statistics
 from pathlib import Path
 
 import hma_model.play
+from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import write_atomic
 from hma_model.checkpoint.folder import BUNDLED, Checkpoint
 from hma_model.play.holding import MEASURED
@@ -26,14 +28,16 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(hma_model.play.__file__).parent / MEASURED)
     parser.add_argument("--scenes", type=int, default=4)
     parser.add_argument("--frames", type=int, default=300)
+    parser.add_argument("--shards", nargs="*", default=[], help="recordings of robots without a simulator")
     parser.add_argument("--device", default="cpu")
     given = parser.parse_args()
     checkpoint = Checkpoint.open(given.checkpoint)
     world = load_world(given.checkpoint, device=given.device)
-    robots = drivable(checkpoint, (), lambda: world.tokenizer)
+    robots = drivable(checkpoint, map(ShardSet, given.shards), lambda: world.tokenizer)
     sessions: dict[str, list[Session]] = {}
-    for name, robot in robots.items():
-        if robot.source == "simulator":
+    for robot in robots.values():
+        if robot.source != "images":
+            name = robot.embodiment.id
             sessions[name] = [
                 Session(name, robot, n, robot.scene(n), world, world.decoding) for n in range(given.scenes)
             ]
@@ -45,13 +49,15 @@ def main() -> None:
         chunks = {session.row: session.next_chunk() for session in live}
         images = world.step({row: chunk for row, chunk in chunks.items() if chunk is not None})
         for session in live:
-            session.take(images[session.row], 0.0, 0.0)
-        print(f"frame {frame + 1}: {len(live)} sessions", flush=True)
+            if session.row in images:
+                session.take(images[session.row], 0.0, 0.0)
+        print(f"frame {frame + 1}: {len(images)} sessions", flush=True)
     found = {}
     for name, some in sessions.items():
-        hz = robots[name].embodiment.effective_hz
-        frames = statistics.median_low(session.parted or given.frames for session in some)
-        at_least = frames >= given.frames
+        hz = some[0].robot.embodiment.effective_hz
+        frames, at_least = statistics.median_low(
+            (one.parted or one.frames[-1].number, one.parted is None) for one in some
+        )
         found[name] = {"seconds": round(frames / hz, 1), "at_least": at_least}
     bundled = {Checkpoint.open(part).trunk_sha256 for part in BUNDLED.values()}
     before = json.loads(given.out.read_text()) if given.out.exists() else {}

@@ -55,9 +55,9 @@ def test_the_bundled_model_is_played_with_all_its_checkpoints(served) -> None:
     assert [part.checkpoint.name for part in parts] == list(BUNDLED)
     assert name == "the bundled model" and settings["first"] == "pusht_fast"
     robots = [set(part.robots) for part in parts]
-    assert robots[0] == {"pendulum"} and robots[4] == {"pusht_fast"}
+    assert robots[0] == {"pendulum"} and robots[4:] == [{"fetch:images"}, {"pusht_fast"}]
     assert "arm2_02" in robots[1] and "rails_03" in robots[2] and "rails_09" in robots[3]
-    assert sum(map(len, robots)) == len(set.union(*robots)) == 16
+    assert sum(map(len, robots)) == len(set.union(*robots)) == 17
 
 
 def test_a_folder_of_the_bundled_models_name_is_played_alone(tmp_path, served, monkeypatch) -> None:
