@@ -97,6 +97,7 @@ def test_a_dataset_is_added_to_shards_that_are_there_and_kept(tmp_path: Path) ->
     assert len(list(tmp_path.glob("one/shards/*/*.parquet"))) == 1
 
 
+@pytest.mark.slow
 def test_without_a_usable_episode_neither_is_written(tmp_path: Path) -> None:
     data, robot = hdf5(tmp_path)
     values = robot.to_dict() | {"quality": {"blank": "refuse"}}

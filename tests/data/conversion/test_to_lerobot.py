@@ -155,6 +155,7 @@ def numbered(folder: Path) -> list[dict]:
     return rows
 
 
+@pytest.mark.slow
 def test_the_dataset_converts_to_the_shards_of_its_recording(tmp_path: Path) -> None:
     data, robot = rlds(tmp_path)
     to_lerobot(robot, data, tmp_path / "out")

@@ -116,6 +116,7 @@ def test_a_reader_comes_back_with_its_weights_and_values(folder: Path) -> None:
     assert found["error"].tolist() == [0.5, 2.0] and found["driven"] == 1
 
 
+@pytest.mark.slow
 def test_a_kept_probe_reads_as_the_trained_one(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in {"EPISODES": 3, "HELD_OUT_EPISODES": 1, "EPISODE_FRAMES": 8}.items():
         monkeypatch.setattr(probe, name, value)

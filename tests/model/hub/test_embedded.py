@@ -46,6 +46,7 @@ def test_of_a_bundled_checkpoint_with_its_own_colours_the_option_that_takes_them
         folder.require_tokenizer(own.config, shards.spec, "shards")
 
 
+@pytest.mark.slow
 def test_the_name_embedded_stands_for_the_network_of_the_tokenizer_of_the_shards(tmp_path) -> None:
     shards = make_shards(tmp_path / "shards", "my_arm", spec=get_spec("palette-64"))
     given = ["--data", str(shards), "steps=1", "batch_size=1", "--out", str(tmp_path / "run")]

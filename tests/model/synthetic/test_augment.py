@@ -307,6 +307,7 @@ def test_a_policy_that_was_edited_does_not_continue_a_job(world, tmp_path, monke
     sys.modules.pop("moves")
 
 
+@pytest.mark.slow
 def test_episodes_of_several_cameras_hold_each_in_its_place(tmp_path, monkeypatch) -> None:
     recording, tokenizer = three.write_hdf5(tmp_path / "three.hdf5"), BlockTokenizer()
     taken = Settings(cameras=("all",))

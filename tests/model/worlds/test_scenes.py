@@ -117,6 +117,7 @@ def test_values_without_names_are_labelled_by_the_end_of_their_key() -> None:
 def test_all_robots_of_the_embedded_model_can_be_driven() -> None:
     parts = [drivable(Checkpoint.open(part), (), pytest.fail) for part in BUNDLED.values()]
     robots = {name: robot for part in parts for name, robot in part.items()}
+    assert not isinstance(robots.pop("fetch:images"), LabRobot)
     assert len(robots) == 16 and all(isinstance(robot, LabRobot) for robot in robots.values())
 
 
@@ -147,7 +148,7 @@ def test_what_truly_happens_is_shown_in_the_size_of_the_models_images(size: int)
     scene = robot.scene(0)
     found = scene.advance(None)
     assert scene.prompt.frames.shape == (PROMPT_FRAMES, size, size, 3) and found[1].shape == (size, size, 3)
-    session = Session("s", robot, 0, Scaled(), Decoding(2, 0.0), 0.0)
+    session = Session("s", robot, 0, robot.scene(0), Scaled(), Decoding(2, 0.0))
     assert session.start.psnr is not None
 
 
@@ -156,7 +157,7 @@ def test_a_session_that_cannot_begin_leaves_its_place(monkeypatch: pytest.Monkey
     world = TrueWorld()
     monkeypatch.setattr(world, "image", lambda row: np.zeros((3, 3, 3), np.uint8))
     with pytest.raises(UsageError, match="images must both be"):
-        Session("s", robot, 0, world, Decoding(2, 0.0), 0.0)
+        Session("s", robot, 0, robot.scene(0), world, Decoding(2, 0.0))
     assert not world.rows
 
 
@@ -229,7 +230,7 @@ def test_recorded_actions_that_nobody_knows_reach_the_model_as_unknown_and_nobod
         return batch
 
     monkeypatch.setattr(windows, "batch", masked)
-    session = Session("s", robot, 0, world, Decoding(2, 0.0), 0.0)
+    session = Session("s", robot, 0, robot.scene(0), world, Decoding(2, 0.0))
     np.testing.assert_array_equal(world.begun[0][1][:2], whole.prompt.chunks[:2])
     assert np.isnan(world.begun[0][1][2]).all()
     np.testing.assert_array_equal(session.held, whole.prompt.chunks[1, -3:])
@@ -329,7 +330,7 @@ def test_a_saved_dataset_reads_as_what_was_driven(name: str, tmp_path: Path) -> 
     (robot,) = lab_robots(name).values()
     world = TrueWorld()
     session, rng = (
-        Session("s", robot, 0, world, Decoding(2, 0.0), 0.0),
+        Session("s", robot, 0, robot.scene(0), world, Decoding(2, 0.0)),
         np.random.default_rng(0),
     )
     low, high = (np.array([getattr(dim, end) for dim in robot.dimensions]) for end in ("low", "high"))
