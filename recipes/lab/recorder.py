@@ -223,7 +223,7 @@ def record_simulator(
         finals.append(out / f"{embodiment.id}_perturbed{ending}")
     if all(final.exists() for final in finals):
         raise OutputError(finals[-1], "exists already", "remove it or record into another folder")
-    kept = out / f".{embodiment.id}-{seed}-{simulator.steps}.episodes"
+    kept = out / f".{embodiment.id}-{seed}.episodes"
     files = list(_record_all(simulator, kept, episodes, seed, perturb))
     for final, own in zip(finals, ([f for f, k in files if not k], [f for f, k in files if k]), strict=False):
         if not final.exists():
@@ -421,14 +421,11 @@ def main(start: Callable[[], Simulator], description: str | None) -> None:
     parser.add_argument(
         "--perturb", type=int, default=0, metavar="K", help="perturbed copies of each episode"
     )
-    parser.add_argument("--frames", type=int, help="length of each episode; default: until it is done")
     given = parser.parse_args()
     begun = time.monotonic()
     try:
         with _drawing():
             simulator = start()
-        if given.frames:
-            simulator.least = simulator.steps = given.frames
         for final in record_simulator(simulator, given.out, given.episodes, given.seed, given.perturb):
             print(f"{final}: {human_bytes(_size(final))}, after {human_seconds(time.monotonic() - begun)}")
     except HMAError as fault:

@@ -14,13 +14,9 @@ for part in 7 8 9 10; do
     uv run "$here/recipes/lab/fetch.py" "$out/part" --episodes $((${EPISODES:-800} / 4)) --seed "$part"
     mv "$out/part/fetch.hdf5" "$out/recordings/$part.hdf5"
 done
-hma convert "$out/recordings" -e fetch --tokenizer palette-64 --frames strided --val-fraction 0.05 \
-    --out "$out/shards"
+hma convert "$out/recordings" -e fetch --tokenizer palette-64 --frames strided --out "$out/shards"
 OMP_NUM_THREADS=1 torchrun --nproc-per-node "${PROCESSES:-2}" --no-python \
     hma train world_fetch "data=$out/shards" "$@" --out "$out/run"
 hma evaluate "$out/run" "$out/shards" --windows 24 | tee "$out/evaluation.txt"
-[ -e "$out/long/fetch.hdf5" ] ||
-    uv run "$here/recipes/lab/fetch.py" "$out/long" --episodes 10 --seed 77 --frames 160
-hma convert "$out/long/fetch.hdf5" -e fetch --tokenizer palette-64 --frames strided --val-fraction 0.9 \
-    --out "$out/long/shards"
-hma generate "$out/run" "$out/long/shards" --out "$out/film.webp"
+python "$here/recipes/world/film.py" fetch --checkpoint "$out/run" --shards "$out/shards" --scenes 2 5 10 \
+    --out "$out/film.webp"

@@ -1,7 +1,7 @@
 """Film a robot that is driven in `hma play`: the world model and the truth under the same actions.
 
     python recipes/world/film.py arm2_07 --scenes 1 --out film.webp
-    python recipes/world/film.py fetch --shards build/fetch/shards --scenes 0 1 2 --out docs/drive.webp
+    python recipes/world/film.py fetch --shards OUT/shards --scenes 2 5 10 --out film.webp  # README
 
 The truth is the robot's simulator, driven by its own driver, or held-out recordings of --shards. Each scene
 begins with the last frame of the prompt.
