@@ -35,7 +35,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/export": (1_172, 9_349, 9),
     "hma_model/generation": (1_636, 13_226, 9),
     "hma_model/hub": (1_057, 8_198, 6),
-    "hma_model/lerobot_env": (636, 4_781, 3),
+    "hma_model/lerobot_env": (636, 4_798, 3),
     "hma_model/network": (3_498, 30_700, 18),
     "hma_model/play": (1_610, 11_875, 8),
     "hma_model/policies": (2_776, 19_807, 14),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_697, 30_301, 20),
     "hma_model/worlds": (1_525, 11_755, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_647, 520_850
-TEST_LINES = 48_677
+PRODUCT_LINES, PRODUCT_NODES = 65_647, 520_867
+TEST_LINES = 48_680
 DOC_WORDS = 41_990
 
 

@@ -178,17 +178,17 @@ class LeRobotVectorEnv(WorldModelVectorEnv):
     def reset(  # type: ignore[override]
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start episodes in all environments, as `WorldModelVectorEnv.reset` does."""
+        """Start episodes, as `WorldModelVectorEnv.reset` does."""
         for env in self.envs:
             env.judge = self.judge
         options = {key: value for key, value in (options or {}).items() if key != NEW_ROLLOUT}
         _, infos = super().reset(seed=seed, options=options)
-        self._frames[:] = 0
-        for facts in (self._scores, self._success, self._truncated):
-            facts[:] = 0
+        begun = np.flatnonzero(options.get("reset_mask", np.ones(self.num_envs)))
+        for facts in (self._frames, self._scores, self._success, self._truncated):
+            facts[begun] = 0
         if isinstance(self.judge, StateJudge):  # of scores below 0, which distances are, 0 would be the best
-            self._scores[:] = self.judge.score(np.stack([env.image for env in self.envs])[:, None])
-        self._read(np.arange(self.num_envs))
+            self._scores[begun] = self.judge.score(np.stack([self.envs[i].image for i in begun])[:, None])
+        self._read(begun)
         return self._seen(), infos
 
     def step(  # type: ignore[override]

@@ -91,6 +91,9 @@ def test_an_episode_that_has_ended_stays_as_it_is(env, monkeypatch) -> None:
     np.testing.assert_array_equal(later["pixels"][0], seen["pixels"][0])
     assert max(dreamed[stride:]) == 1 and rewards[0] == 0
     assert truncated.tolist() == [False, True] and info["is_success"].tolist() == [True, False]
+    env.reset(options={"reset_mask": np.array([False, True])})
+    _, _, _, truncated, info = env.step(actions)
+    assert info["is_success"].tolist() == [True, False] and not truncated.any() and info["frames"][0] == 1
     assert not env.reset()[1].get("is_success") and not env.ended.any()
 
 
