@@ -45,7 +45,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/worlds": (1_525, 11_755, 6),
 }
 PRODUCT_LINES, PRODUCT_NODES = 65_647, 520_867
-TEST_LINES = 48_680
+TEST_LINES = 48_687
 DOC_WORDS = 41_990
 
 

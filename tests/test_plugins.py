@@ -70,6 +70,7 @@ def episodes(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 def test_the_example_of_the_page_runs(toy_robot: None, episodes: Path) -> None:
     assert [words.split()[0] for words in COMMANDS] == ["inspect", "registry", "convert", "shards"]
     for words in COMMANDS:

@@ -16,6 +16,7 @@ from hma_data import __version__
 from hma_model.checkpoint.folder import BUNDLED
 
 ROOT = Path(__file__).resolve().parents[1]
+pytestmark = pytest.mark.slow  # a wheel is built
 
 
 @pytest.fixture(scope="module")

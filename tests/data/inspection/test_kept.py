@@ -91,6 +91,7 @@ def test_a_camera_whose_key_holds_no_images_is_a_finding_and_no_crash(tmp_path: 
     assert any(one.severity == "error" for one in examine(recording, path))
 
 
+@pytest.mark.slow
 def test_tokens_that_lose_the_robot_are_a_warning_and_with_the_crop_they_keep_it(tmp_path: Path) -> None:
     recording = record(tmp_path / "arm.hdf5", 200)
 

@@ -138,6 +138,7 @@ def test_most_robots_push_a_block_in_some_of_their_episodes() -> None:
     assert sum(pushed) >= 20
 
 
+@pytest.mark.slow
 def test_pushing_moves_blocks_further() -> None:
     body = Body.of("mover_10")
     moved = [

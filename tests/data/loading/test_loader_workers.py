@@ -103,6 +103,7 @@ def test_the_state_of_one_rank_serves_another(sets: list[Path]) -> None:
     assert seen(iter(second), 5) == whole[7:]
 
 
+@pytest.mark.slow
 def test_a_dataloader_gives_the_same_batches_after_some_were_taken_here(sets: list[Path]) -> None:
     whole = seen(iter(dataset(sets)), 12)
     data = dataset(sets)

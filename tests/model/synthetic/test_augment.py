@@ -84,6 +84,7 @@ def test_replayed_episodes_hold_the_recorders_actions_and_say_that_they_are_synt
         np.testing.assert_array_equal(columns["tokens"][:known].reshape(stored.shape), stored)
 
 
+@pytest.mark.slow
 def test_the_plan_names_a_precision_that_changes_tokens(world, monkeypatch, tmp_path) -> None:
     assert augment(tmp_path / "whole", asked(), world=world).plan["made_by"]["precision"] == "float32"
     monkeypatch.setattr(world, "precision", "bf16")

@@ -148,6 +148,7 @@ def of_squares(data: list[str], **changes: object) -> Recipe:
     return recipe(data, **given, accumulate=2, **changes)
 
 
+@pytest.mark.slow
 def test_a_run_on_squares_goes_on_with_the_same_bits_and_is_tuned_on_whole_frames(moving, tmp_path):
     whole = train(of_squares(moving), out=tmp_path / "whole", show=False)
     train_until(of_squares(moving), tmp_path / "cut", 3)
