@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from hma_data.errors import CheckpointError, HMAError, OutputError
+from hma_data.storage.kinds import one_line, unreadable
 from hma_data.storage.remote import RemotePath, put_bytes, put_file
 
 PART = ".part"  # ends the name of every unfinished file
@@ -225,6 +226,21 @@ def read_json(path: Path, error: type[HMAError] = CheckpointError) -> dict[str, 
     except OSError as fault:
         raise error(path, f"cannot be read: {fault.strerror}") from fault
     return json_object(content, path, error)
+
+
+@contextmanager
+def opened_weights(
+    path: Path, error: type[HMAError] = CheckpointError, framework: str = "np"
+) -> Iterator[Any]:
+    """Open a safetensors file; raise `error` where it cannot be read to its end."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework) as file:
+            yield file
+    except (SafetensorError, OSError) as fault:
+        text = f"is not a complete safetensors file: {one_line(fault)}"
+        raise error(path, *unreadable(path, text, "name another file, or download it again")) from fault
 
 
 def to_json(values: Any) -> bytes:

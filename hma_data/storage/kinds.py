@@ -56,6 +56,11 @@ def own_layout(files: Iterable[Path]) -> str:
     return ", ".join(held) if any(counts[suffix] for suffix in _ARRAYS) else ""
 
 
+def one_line(fault: object, length: int = 160) -> str:
+    """Return the text of an error as one line of at most so many letters."""
+    return " ".join(str(fault).split())[:length]
+
+
 def unreadable(path: Path, fault: str, remedy: str) -> tuple[str, str]:
     """Return fault and remedy of a file or folder that could not be read.
 

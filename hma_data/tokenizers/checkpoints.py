@@ -25,11 +25,11 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from hma_data.errors import HMAError, TokenizerError
-from hma_data.storage.files import file_sha256, read_json, write_atomic
-from hma_data.storage.kinds import unreadable
+from hma_data.storage.files import file_sha256, opened_weights, read_json, write_atomic
+from hma_data.storage.kinds import one_line, unreadable
 from hma_data.tokenizers.base import OTHER
 from hma_data.tokenizers.catalog import Entry, find_entry
-from hma_data.tokenizers.shapes import one_line, opened_weights, read_shape
+from hma_data.tokenizers.shapes import read_shape
 
 FOLDER = "HMA_WEIGHTS"  # environment variable: a folder of weights, named after the tokenizers
 SUFFIXES = (".safetensors", ".ckpt", ".pt", ".pth")
@@ -182,7 +182,7 @@ def read_tensors(path: Path, error: type[HMAError] = TokenizerError) -> Tensors:
 
 def _read_safetensors(path: Path, error: type[HMAError] = TokenizerError) -> Tensors:
     """Return the tensors of a safetensors file."""
-    with opened_weights(path, "pt", error) as file:
+    with opened_weights(path, error, "pt") as file:
         return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
 
 

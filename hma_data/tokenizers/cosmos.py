@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hma_data.errors import TokenizerError
+from hma_data.storage.kinds import one_line
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_data.tokenizers.checkpoints import digest_of, find_weights, pair_of
 from hma_data.tokenizers.network import NetworkTokenizer, open_device
-from hma_data.tokenizers.shapes import one_line
 
 VERSION = 1
 IMAGE_SIZE = 256

@@ -6,10 +6,9 @@ The command that plans a conversion needs what a tokenizer is, not its network: 
 import math
 import re
 import sys
-from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -17,11 +16,10 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
-from safetensors import SafetensorError, safe_open
 
-from hma_data.errors import HMAError, TokenizerError
-from hma_data.storage.files import file_sha256, read_json
-from hma_data.storage.kinds import unreadable
+from hma_data.errors import TokenizerError
+from hma_data.storage.files import file_sha256, opened_weights, read_json
+from hma_data.storage.kinds import one_line
 from hma_data.storage.paths import StrPath, as_text
 from hma_data.tokenizers.base import TokenizerSpec, filtered, get_tokenizer, usable_entry
 from hma_data.tokenizers.catalog import CATALOG, EMBEDDED
@@ -115,24 +113,6 @@ class VaeConfig(BaseModel):
         return TokenizerSpec.continuous(name, VERSION, image_size, PATCH, self.channels, **facts)
 
 
-@contextmanager
-def opened_weights(
-    path: Path, framework: str = "np", error: type[HMAError] = TokenizerError
-) -> Iterator[Any]:
-    """Open a safetensors file; raise `error` where it cannot be read to its end."""
-    try:
-        with safe_open(path, framework) as file:
-            yield file
-    except (SafetensorError, OSError) as fault:
-        text = f"is not a complete safetensors file: {one_line(fault)}"
-        raise error(path, *unreadable(path, text, "name another file, or download it again")) from fault
-
-
-def one_line(fault: object, length: int = 160) -> str:
-    """Return the text of an error as one line of at most so many letters."""
-    return " ".join(str(fault).split())[:length]
-
-
 def read_shape[C: BaseModel](path: Path, form: str, config: type[C]) -> tuple[C, str]:
     """Read the network's shape from a weights' file; return it and its tokens' digest.
 
@@ -141,7 +121,7 @@ def read_shape[C: BaseModel](path: Path, form: str, config: type[C]) -> tuple[C,
     Raises:
         TokenizerError: there is no such file, or it is not safetensors, truncated, or of another network.
     """
-    with opened_weights(path) as file:
+    with opened_weights(path, TokenizerError) as file:
         metadata = file.metadata() or {}
     remedy = "take the file that `hma tokenizer train` writes, or leave --weights out"
     if metadata.get("format") != form:
@@ -167,7 +147,7 @@ def read_colors(path: Path) -> NDArray[np.uint8]:
         return parse_colors(spec.get("colors") if isinstance(spec, dict) else None, path)
     if path.is_dir():
         raise TokenizerError(path, "is a folder, not a file of colours", _COLORS)
-    with opened_weights(path) as file:
+    with opened_weights(path, TokenizerError) as file:
         held = file.keys()
         colors: NDArray[Any] = file.get_tensor("colors") if "colors" in held else np.zeros(0)
     if colors.dtype != np.uint8 or colors.shape[1:] != (3,) or not 2 <= len(colors) <= MOST_COLORS:

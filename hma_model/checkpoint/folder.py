@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from hma_data.errors import CheckpointError, HMAError
 from hma_data.registry.embodiment import ID_PATTERN, Embodiment
-from hma_data.storage.files import file_sha256, read_json
+from hma_data.storage.files import file_sha256, opened_weights, read_json
 from hma_data.storage.kinds import misplaced, unreadable
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.config import HMAConfig
@@ -270,9 +270,7 @@ def training_checkpoints(run: StrPath) -> list[Path]:
 
 def read_metadata(path: Path) -> dict[str, str]:
     """Read the metadata in the header of a safetensors file."""
-    from hma_data.tokenizers.shapes import opened_weights
-
-    with opened_weights(path, error=CheckpointError) as file:  # the header alone needs no torch
+    with opened_weights(path) as file:  # the header alone needs no torch
         return file.metadata() or {}
 
 

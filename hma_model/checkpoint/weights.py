@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hma_data.errors import CheckpointError
-from hma_data.tokenizers.shapes import opened_weights
+from hma_data.storage.files import opened_weights
 from hma_model.checkpoint.folder import Checkpoint
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ _REMEDY = "pull the checkpoint again; if the error stays, do not use it"
 
 def read_tensors(path: Path) -> State:
     """Read all tensors of a safetensors file to the CPU."""
-    with opened_weights(path, "pt", CheckpointError) as file:
+    with opened_weights(path, framework="pt") as file:
         return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
 
 

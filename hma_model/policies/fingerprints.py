@@ -40,11 +40,15 @@ def policy_facts(words: str, embodiment: str) -> dict[str, str]:
             return {"trunk": kept.trunk_sha256} | parts
         return {}  # of the hub or a store
     if kind == "lerobot" and rest:
-        folder = Path(rest)
-        files = sorted(path for path in folder.rglob("*") if path.is_file())
-        return {str(path.relative_to(folder)): file_sha256(path) for path in files}
+        return folder_facts(Path(rest))
     source = getattr(sys.modules.get(kind), "__file__", None) if rest else None
     return {"module": file_sha256(Path(source))} if source else {}
+
+
+def folder_facts(folder: Path) -> dict[str, str]:
+    """Return names and SHA-256 of the files in a folder; nothing if it is none, as of a hub's repository."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): file_sha256(path) for path in files}
 
 
 def world_facts(world: World) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from contextlib import closing, nullcontext
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,7 @@ from hma_model.generation.decode import cameras_for
 from hma_model.policies.arenas import Beginning, ModelArena, Scenes
 from hma_model.policies.base import Judged, Policy, begin, checked
 from hma_model.policies.catalog import read_policy
-from hma_model.policies.fingerprints import policy_facts
+from hma_model.policies.fingerprints import folder_facts
 from hma_model.policies.report import rate
 from hma_model.policies.rewards import RewardJudge, labelled_shards, measured_judge
 from hma_model.policies.scores import (
@@ -172,7 +173,7 @@ def evaluate_recorded(
         for name, policy in zip(names, made, strict=True):
             _try(name, policy, world, begun)
         digest = hashlib.sha256(labelled.manifest.to_text().encode()).hexdigest()
-        files = policy_facts(f"lerobot:{judge}", embodiment)
+        files = folder_facts(Path(judge))
         judged_by = {"shards_sha256": digest, "judge": judge, "judge_sha256": files}
         kept = kept_policies(folder, world, scenes, frames, judged_by)
         keys = part_keys(policies, world, embodiment, judge) if folder else names

@@ -15,6 +15,7 @@ from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import chain
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -38,7 +39,7 @@ from hma_model.generation.decode import cameras_for
 from hma_model.policies.arenas import Arena, Beginning, ModelArena, Scenes, TrueArena
 from hma_model.policies.base import Judged, Policy
 from hma_model.policies.catalog import read_policy
-from hma_model.policies.fingerprints import device_facts, policy_facts, world_digests
+from hma_model.policies.fingerprints import device_facts, folder_facts, policy_facts, world_digests
 from hma_model.policies.judge import StateJudge, task_of, train_judge
 from hma_model.policies.rewards import RewardModel, labelled_shards, measured_judge, names_reward_model
 from hma_model.policies.scores import Progress, choosing_meter, run
@@ -210,9 +211,11 @@ def augment(
         found = finished(folder, made_by)
         if found is None:
             maker = _Maker(world, settings, begins)
-            asked = settings.commands, f"lerobot:{settings.judge}"  # their files may change in between
-            files = {"files": [policy_facts(words, settings.embodiment) for words in asked]}
-            kept = KeptParts(folder / WORK, made_by | device_facts(world.model) | files)
+            facts = made_by | device_facts(world.model)
+            facts["policy_files"] = policy_facts(settings.commands, settings.embodiment)  # may be edited
+            if settings.rewarded:
+                facts["judge_files"] = folder_facts(Path(str(settings.judge)))
+            kept = KeptParts(folder / WORK, facts)
             batches = maker.run(kept, on_progress)
             spec = world.tokenizer.spec
             chosen = _chosen(batches, settings, UNCERTAINTY_FLAGS[spec.kind], meter)

@@ -11,7 +11,8 @@ here=$(cd "$(dirname "$0")/../.." && pwd)
 mkdir -p "$out/recordings"
 for part in 7 8 9 10; do
     [ -e "$out/recordings/$part.hdf5" ] && continue
-    uv run "$here/recipes/lab/fetch.py" "$out/part" --episodes $((${EPISODES:-800} / 4)) --seed "$part"
+    [ -e "$out/part/fetch.hdf5" ] ||
+        uv run "$here/recipes/lab/fetch.py" "$out/part" --episodes $((${EPISODES:-800} / 4)) --seed "$part"
     mv "$out/part/fetch.hdf5" "$out/recordings/$part.hdf5"
 done
 hma convert "$out/recordings" -e fetch --tokenizer palette-64 --frames strided --out "$out/shards"

@@ -12,7 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from hma_data.console import run_script
 from hma_data.episodes.sheets import webp_bytes
+from hma_data.errors import UsageError
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import write_atomic
 from hma_model.checkpoint.folder import EMBEDDED_NAME, Checkpoint
@@ -37,6 +39,8 @@ def main() -> None:
     checkpoint = Checkpoint.open(given.checkpoint, [given.robot])
     sets = [ShardSet(given.shards)] if given.shards else []
     robot = next(iter(drivable(checkpoint, sets, lambda: world.tokenizer).values()))
+    if robot.source == "images":
+        raise UsageError(given.robot, "has no simulator", "give its recordings, --shards")
     hz, label = robot.embodiment.effective_hz, "recording" if given.shards else "simulator"
     frames, scores = [], []
     for scene in given.scenes:
@@ -54,4 +58,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)
