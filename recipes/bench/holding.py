@@ -13,6 +13,7 @@ import statistics
 from pathlib import Path
 
 import hma_model.play
+from hma_data.console import run_script
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import write_atomic
 from hma_model.checkpoint.folder import BUNDLED, Checkpoint
@@ -66,4 +67,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -10,6 +10,7 @@ import argparse
 import shutil
 from pathlib import Path
 
+from hma_data.console import run_script
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.lab import record
@@ -59,4 +60,4 @@ def judged(name: str, checkpoint: Path, work: Path, tokenizer: object) -> Path:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)
