@@ -8,7 +8,8 @@ import dataclasses
 import inspect
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Container, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,9 @@ def table(heads: list[str], rows: list[list[str]]) -> str:
 
 # -- the command line
 
+OPTION = ["option", "meaning", "default or range"]
+SHARED_BY = 4  # an option that is the same in this many commands is explained once
+
 
 def cli_page() -> str:
     """Return the page of all commands, from the application itself."""
@@ -42,10 +46,12 @@ def cli_page() -> str:
         f"{MADE}# Command line\n\nThe `--help` of every command. Each also takes `--help`, and "
         "`--debug` (also before the command), which shows tracebacks."
     ]
-    root = typer.main.get_command(app)
-    for name, command in _commands(root, "hma"):
-        parts += _command(name, command)
-    parts.append(_EXIT_CODES)
+    commands = list(_commands(typer.main.get_command(app), "hma"))
+    rows = Counter(row for name, command in commands for row in map(tuple, _rows(name, command)[1]))
+    shared = [row for row, times in rows.items() if times >= SHARED_BY]
+    for name, command in commands:
+        parts += _command(name, command, shared)
+    parts += ["## Shared options", table(OPTION, sorted(map(list, shared))), _EXIT_CODES]
     return "\n\n".join(parts) + "\n"
 
 
@@ -66,24 +72,33 @@ def _commands(command: Any, name: str) -> Iterator[tuple[str, Any]]:
         yield from _commands(inner, f"{name} {word}")
 
 
-def _command(name: str, command: Any) -> list[str]:
+def _command(name: str, command: Any, shared: Container[tuple[str, ...]]) -> list[str]:
     """Return the section of one command."""
-    context = typer.Context(command, info_name=name)
     about, _, example = inspect.cleandoc(command.help or "").partition("Example:")
     parts = ["#" * len(name.split()) + " " + name, _escaped(about.strip())]
     if example:
         parts.append(f"```bash\n{' '.join(example.split())}\n```")
-    rows, options = [], []
+    arguments, options = _rows(name, command)
+    if arguments:
+        parts.append(table(["argument", *OPTION[1:]], arguments))
+    if own := [row for row in options if tuple(row) not in shared]:
+        parts.append(table(OPTION, own))
+    if others := [re.sub(" <.*>", "", row[0]) for row in options if tuple(row) in shared]:
+        parts.append(f"[Shared options](#shared-options): {', '.join(others)}")
+    return parts
+
+
+def _rows(name: str, command: Any) -> tuple[list[list[str]], list[list[str]]]:
+    """Return the table rows of a command's arguments and of its options."""
+    context = typer.Context(command, info_name=name)
+    arguments, options = [], []
     for param in command.params:
         record = param.get_help_record(context)
         if record is None or "--help" in record[0]:
             continue
         row = [f"`{_spelled(param, record[0])}`", *_said(record[1])]
-        (options if param.param_type_name == "option" else rows).append(row)
-    for kind, found in (("argument", rows), ("option", options)):
-        if found:
-            parts.append(table([kind, "meaning", "default or range"], found))
-    return parts
+        (options if param.param_type_name == "option" else arguments).append(row)
+    return arguments, options
 
 
 def _spelled(param: Any, names: str) -> str:
