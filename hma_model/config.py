@@ -133,8 +133,8 @@ class HMAConfig:
     # too). With "tokens", a single hidden chunk is hidden only in the action tokens; modulation still sees
     # it, as in the released code.
     absent_action: str = "embedding"
-    # Octaves of sines and cosines of each value of a chunk, as inputs with the values, for higher action
-    # resolution. The longest wave is 8 standard deviations of the value.
+    # Octaves of sines and cosines of each action value, added to the stem's input for higher resolution. The
+    # longest wave is 8 standard deviations of the value.
     action_waves: int = 0
     action_alignment: str = "previous"  # chunk k conditions frame k+1; "current": frame k (released)
 
@@ -142,8 +142,8 @@ class HMAConfig:
     # attention or after the last block; a projection per embodiment after the modulated norm; unnormalized
     # action targets
     layout: str = "ours"
-    qkv_bias: bool = False
-    mlp_bias: bool = True
+    qkv_bias: bool = False  # biases of queries, keys and values
+    mlp_bias: bool = True  # biases of the MLP
     qk_norm: bool = False  # normalize queries and keys, not the inputs of spatial attention and MLP
     mup: bool = False  # attention scale 8 / head_dim, and a readout scaled down as the width grows
     base_width: int = 256  # the width at which muP's multipliers are one
@@ -151,19 +151,19 @@ class HMAConfig:
     # How often each objective is drawn.
     objectives: Mapping[str, float] = field(default_factory=lambda: {"forward": 1.0})
     action_loss: str = "mse"
-    label_smoothing: float = 0.01
+    label_smoothing: float = 0.01  # of the cross-entropy of digits
     # Each sample's corruption is drawn from U(0, corrupt_max): the share of digits replaced at random.
     corrupt_max: float = 0.2
     # continuous: the noise in a visible frame has the standard deviation latent_noise × corruption
     latent_noise: float = 0.0
-    told_noise: bool = False  # an input tells the model each frame's corruption; 0 after training
+    told_noise: bool = False  # each frame's corruption is an input; 0 after training
     # The share of samples whose longer history stays unmasked, with later frames corrupted more.
     history_probability: float = 0.2
     # The frames of a training pass that predicts video. "window": the window's frames, masked (paper).
     # "pairs": the recorded frames, and masked copies from the second on that attend to earlier recorded ones.
     training_pass: str = "window"
     whole_share: float = 0.5  # pairs: the share of fully masked copies
-    crop: int = 0  # U-Net: side in tokens of the squares of frames that are trained on; 0: whole frames
+    crop: int = 0  # U-Net: train on squares of frames of this side, in tokens; 0: on whole frames
     # The input embedding of a masked token. "learned": one vector (paper). "previous": that vector plus the
     # embedding of the same position in the previous frame.
     masked_input: str = "learned"
@@ -179,10 +179,10 @@ class HMAConfig:
     # since the previous frame, in which moving values weigh up to 1 + motion_weight
     video_loss: str = "diffusion"
     motion_weight: float = 6.0  # see video_loss
-    diffusion_target: str = "velocity"  # what the head predicts; the paper's is "noise"
+    diffusion_target: str = "velocity"  # what the head predicts; in the paper "noise"
     diffusion_depth: int = 3  # layers of the head
     diffusion_width: int = 1024  # width of the head
-    diffusion_sample_steps: int = 4  # DDIM steps; the paper takes 100 with the target "noise"
+    diffusion_sample_steps: int = 4  # DDIM steps; the paper uses 100 with the target "noise"
     diffusion_variance: bool = False  # the head has variance outputs, which DDIM ignores (released)
 
     tokenizer: Mapping[str, Any] = field(default_factory=dict)  # the tokenizer's spec, kept for checkpoints

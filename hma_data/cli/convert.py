@@ -57,7 +57,7 @@ def convert(
         str, Option(help="Name of the tokenizer; see hma tokenizer list.", autocompletion=tokenizers)
     ] = TOKENIZER,
     weights: Weights = None,
-    workers: Annotated[int, Option(min=0, help="Worker processes; 0: this process, which a crash ends.")] = 1,
+    workers: Annotated[int, Option(min=0, help="Worker processes; with 0, a crash ends the command.")] = 1,
     settings: Settings,
     frequency_hz: Annotated[
         float | None,

@@ -233,12 +233,12 @@ def shards_split(
     ] = None,
     seed: Annotated[int, Option(help="Seed of the split.")] = 0,
     by: Annotated[
-        Literal["episode", "instruction", "source"], Option(help="Unit kept in one split.")
+        Literal["episode", "instruction", "source"], Option(help="What stays together in one split.")
     ] = "episode",
     workers: Workers = None,
     json: Json = False,
 ) -> None:
-    """Write a new set with another split into train and val.
+    """Write a copy of a shard set, divided differently into train and val.
 
     Example: hma shards split shards/my_arm --val-fraction 0.1 --out shards/my_arm_10
     """
@@ -269,7 +269,7 @@ def shards_export(
     folder: Folder,
     out: Annotated[Path, Option(help="New folder, with a subfolder per split.")],
     to: Annotated[Literal["memmap"], Option(help="memmap: the layout of the paper's code.")] = "memmap",
-    split: Annotated[str | None, Option(help="Only this split, into --out itself.")] = None,
+    split: Annotated[str | None, Option(help="Only this split, directly into --out.")] = None,
     camera: Annotated[str | None, Option(help="Camera to export; default: the first.")] = None,
 ) -> None:
     """Export flat files for the paper's code: video.bin, actions, segment_ids.bin, metadata.json.

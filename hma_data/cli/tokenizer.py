@@ -95,7 +95,7 @@ def tokenizer_eval(
     lpips: Annotated[
         bool | None, Option(help="Measure LPIPS; default: only if it needs no download.")
     ] = None,
-    worst: Annotated[int, Option(min=0, help="Worst frames to draw with --out.")] = 6,
+    worst: Annotated[int, Option(min=0, help="Number of worst frames to draw into --out.")] = 6,
     out: Annotated[Path | None, Option(help="Folder for eval.md, eval.json, worst.png.")] = None,
     device: Device = "cpu",
     json: Json = False,
@@ -141,7 +141,7 @@ def tokenizer_fit(
     frames: Annotated[int, Option(min=1, help="Frames of each video or episode, evenly spaced.")] = 16,
     out: Annotated[Path, Option(help="Output weights.")] = Path("colors.safetensors"),
 ) -> None:
-    """Choose the colours of palette-64 for the images of a simulator; takes seconds.
+    """Choose colours for palette-64 that fit the images of a simulator; takes seconds.
 
     Example: hma tokenizer fit episodes.hdf5 -e my_arm.yaml --out colors.safetensors
     """

@@ -79,14 +79,14 @@ class Component(SpecModel):
     names: tuple[str, ...] | None = Field(
         None, description="one name for each value; messages with names are read by these names"
     )
-    unit: str | None = Field(None, description="of the values, such as m or rad; for plots")
+    unit: str | None = Field(None, description="unit of the values, such as m or rad; for plots")
     normalize: bool = Field(True, description="false keeps raw values, such as of an open/close gripper")
     sign: Number | tuple[Number, ...] = Field(1.0, description="factor: one value, or one per dim")
     offset: Number | tuple[Number, ...] = Field(
         0.0, description="added after `sign`: one value, or one per dim"
     )
     range: tuple[Number, Number] | None = Field(
-        None, description="[low, high] of the values; changes nothing"
+        None, description="[low, high] of the values, for information"
     )
     representation: Representation | None = Field(None, description="how an angle or rotation is represented")
     gripper: Gripper | None = Field(
@@ -152,7 +152,7 @@ class Camera(SpecModel):
     )
     key: str = Field(min_length=1, description="location of the images in the recording")
     size: tuple[Positive, Positive] | None = Field(
-        None, description="[height, width] of recorded images in pixels; changes nothing"
+        None, description="[height, width] of recorded images in pixels, for information"
     )
     color: Literal["rgb", "bgr"] = Field("rgb", description="order of the channels as recorded")
     resize: Literal["short_side_crop", "letterbox", "stretch"] = Field(

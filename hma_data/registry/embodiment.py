@@ -64,12 +64,12 @@ _DECIDES: Any = {
 class Embodiment(SpecModel):
     """A robot as one dataset recorded it. Frozen; made from YAML by `load` or `find`."""
 
-    id: str = Field(description="its id; the file is <id>.yaml")
+    id: str = Field(description="name of the robot's file, <id>.yaml")
     description: str = Field("", description="one line about the recordings")
     robot: str | None = Field(None, description="name of the robot")
     kind: Literal["real", "simulation", "human"] = Field(description="who or what was recorded")
     frequency_hz: Number | Literal["unknown"] | None = Field(
-        description="control rate in Hz; unknown; null only if the recordings have timestamps"
+        description="control rate in Hz, or unknown; null only if the recordings have timestamps"
     )
     target_hz: Number = Field(
         2.0, ge=0.001, le=100_000, description="frame rate of the model; determines the stride"

@@ -210,7 +210,7 @@ def generate(
     seed: Seed = 0,
     cameras: Cameras = None,
 ) -> None:
-    """Write a video: a recording next to the prediction from its first frames and its actions.
+    """Write a video of a recording next to the prediction from its first frames and actions.
 
     Example: hma generate runs/first shards/my_arm --out rollout.mp4
     """

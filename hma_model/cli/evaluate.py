@@ -67,7 +67,7 @@ def evaluate(
         bool, Option("--json", help="Print one line of JSON for each checkpoint and set.")
     ] = False,
 ) -> None:
-    """Measure rollouts with recorded, shuffled and no actions, vs a copy of the prompt's last frame.
+    """Measure rollouts under recorded, shuffled and no actions, and a copy of the last given frame.
 
     With --out, finished parts are kept, and the same command continues.
 

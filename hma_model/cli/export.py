@@ -18,7 +18,7 @@ def export(
         list[Path] | None, Argument(help="Shard sets whose held-out episodes provide first frames.")
     ] = None,
     embodiment: Embodiments = None,
-    starts: Annotated[int, Option(min=1, max=20, help="Start scenes per robot.")] = 3,
+    starts: Annotated[int, Option(min=1, max=20, help="Scenes per robot to start from.")] = 3,
     unmask_steps: UnmaskSteps = 2,
     half: Annotated[
         bool, Option("--half/--float32", help="Store weights in float16 if that costs less than 0.1 dB.")

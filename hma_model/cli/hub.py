@@ -209,7 +209,7 @@ def export_released(
     out: Annotated[Path, Option(help="A new folder: config.json, model.safetensors.")],
     embodiment: Embodiments = None,
 ) -> None:
-    """Write a checkpoint in the layout of the paper's release, for its code to read.
+    """Write a checkpoint in the layout of the paper's release.
 
     Example: hma hub export runs/first --out released
     """

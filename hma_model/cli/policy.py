@@ -58,7 +58,7 @@ def policy_eval(
     ] = None,
     max_error: Annotated[
         float | None,
-        Option(min=0, help="Also report the judge for episodes of at most this expected error, px of 128."),
+        Option(min=0, help="Also report the judge on episodes up to this expected error, in px of 128."),
     ] = None,
     unmask_steps: UnmaskSteps = 2,
     temperature: Temperature = None,
@@ -138,7 +138,7 @@ def augment(
         Option(min=0, help="Drop episodes with a larger expected state error at the end, in px of 128."),
     ] = None,
     judge: Annotated[
-        str, Option(help="Keep only successes, judged by moved, moved=PX, reached, placed, a reward model.")
+        str, Option(help="Keep only successes by a judge: moved, moved=PX, reached, placed, reward model.")
     ] = "",
     lerobot: Annotated[Path | None, Option(help="Also write a LeRobotDataset v3.0 to this folder.")] = None,
     unmask_steps: UnmaskSteps = 2,
@@ -209,7 +209,7 @@ def label_actions(
     device: Device = "auto",
     json: Json = False,
 ) -> None:
-    """Infer the actions of action-free video: write labelled shards, print the error on recorded actions.
+    """Label action-free video with inferred actions; print the error on recorded actions.
 
     Example: hma label-actions videos --checkpoint runs/inverse -e mover_04 --out labelled/mover_04
     """

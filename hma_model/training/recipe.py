@@ -112,8 +112,8 @@ class MixtureSettings(_Settings):
     draw: Literal["per_sample", "per_batch"] = "per_sample"
     weights: dict[str, Number] = Field({}, description="embodiment id -> factor on its probability")
     groups: dict[str, str] = Field({}, description="embodiment id -> group; groups have equal shares")
-    caps: dict[str, Cap] = Field({}, description="embodiment id -> its largest probability")
-    max_epochs: Number | None = Field(None, gt=0, description="passes over an embodiment's windows at most")
+    caps: dict[str, Cap] = Field({}, description="embodiment id -> maximum probability")
+    max_epochs: Number | None = Field(None, gt=0, description="maximum passes over an embodiment's windows")
 
 
 class Recipe(_Settings):
@@ -132,10 +132,10 @@ class Recipe(_Settings):
     start: Place | None = Field(None, description="a checkpoint to start from: folder, run, URI or hub repo")
     freeze: Literal["nothing", "trunk"] = Field("nothing", description="part whose weights stay fixed")
     new_stem: Literal["like", "fresh"] = Field(
-        "like", description="with start: a new robot's stem starts from a similar robot's, or fresh"
+        "like", description="with start: initialise a new stem from a similar robot's, or fresh"
     )
     # a token's digits: the tokenizer's, or split into this many values (FSQ's levels) or joined up to them
-    digits: Count = Field(0, ge=0, description="8 splits 512 into 8 · 8 · 8; 512 joins; 0: the tokenizer's")
+    digits: Count = Field(0, ge=0, description="8 splits 512 into 8 · 8 · 8; 512 joins; 0: as the tokenizer")
     # model.merge or model.patch, unless the recipe gives it, is the least that leaves so few
     places: Count = Field(0, ge=0, description="maximum trunk tokens per camera frame; 0: no limit")
 
@@ -143,7 +143,7 @@ class Recipe(_Settings):
     # an end by time: of a rank's process in steps, all its threads; lr then falls by the share that is spent
     cpu_seconds: Number = Field(0.0, ge=0, description="maximum CPU seconds of training steps; 0: no limit")
     lr: Number = Field(3e-4, gt=0, le=1e6)
-    optimizer: Literal["adamw", "muon"] = Field("adamw", description="muon: for matrices of the blocks")
+    optimizer: Literal["adamw", "muon"] = Field("adamw", description="muon: for the blocks' matrices")
     muon_lr: Number = Field(0.02, gt=0, le=1e3, description="muon: maximum spectral norm of a step")
     lr_rule: Literal["plain", "paper"] = Field(
         "plain", description="paper: lr × windows per step / 64 (1 to 8)"
@@ -155,11 +155,11 @@ class Recipe(_Settings):
     eps: Number = Field(1e-8, gt=0, le=1e6)
     weight_decay: Number = Field(0.05, ge=0, le=1e6)
     clip: Number = Field(1.0, gt=0, description="limit of the gradient norm")
-    nonfinite: Literal["stop", "skip"] = Field("stop", description="what a non-finite loss does")
+    nonfinite: Literal["stop", "skip"] = Field("stop", description="at a non-finite loss: stop, or skip it")
     ema: Beta = Field(0.0, description="decay of averaged weights, which are evaluated and saved; 0: off")
     self_forward: Share = Field(0.0, description="share of windows with a self-predicted past")
-    self_forward_frames: Count = Field(2, ge=1, description="self-predicted frames in a row; U-Net: at least")
-    self_forward_from: Steps = Field(0, description="first step with such windows, counted from 0")
+    self_forward_frames: Count = Field(2, ge=1, description="self-predicted frames in a row (U-Net: minimum)")
+    self_forward_from: Steps = Field(0, description="first step with self-predicted pasts, from 0")
     whole_from: Share = Field(
         1.0, description="with model.crop: share of the run after which frames are whole"
     )
