@@ -46,7 +46,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
 }
 PRODUCT_LINES, PRODUCT_NODES = 65_654, 520_893
 TEST_LINES = 48_687
-DOC_WORDS = 41_990
+DOC_WORDS = 41_700
 
 
 @cache
