@@ -19,7 +19,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
 from hma_data.conversion.output import finished_shards, remove_notes
 from hma_data.conversion.plan import Plan, Settings, ShardUnit, make_plan
@@ -44,13 +43,11 @@ from hma_data.shards.schema import (
     EpisodeRow,
     Footer,
     Refused,
-    RowLayout,
     read_footer,
     to_numpy,
-    token_column,
 )
 from hma_data.shards.verify import REMAKE, OnProgress, shard_problems
-from hma_data.shards.writer import EpisodeRows, ShardWriter
+from hma_data.shards.writer import ShardWriter
 from hma_data.sources.base import EpisodeRef
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath
@@ -142,13 +139,13 @@ def _make_shard(job: _NewSet, plan: Plan, out: Path, unit: ShardUnit, refused: S
         for index, item in zip(unit.numbers.to_pylist(), job.episodes.take(unit.numbers).to_pylist()):
             number, start = item.pop("set"), writer.rows
             old = EpisodeRow(**item)
-            views = {camera: readers[number].episode(item, camera) for camera in layout.cameras}
-            if any((view["episode_index"] != old.episode_index).any() for view in views.values()):
+            columns = readers[number].rows(old.shard, old.row_start, old.length)
+            if (columns["episode_index"] != old.episode_index).any():
                 fault = f"its rows from {old.row_start} on are not episode {old.episode_index}"
                 remedy = "hma shards verify shows what is damaged"
                 raise ShardError(job.sets[number].folder / old.shard, fault, remedy)
-            writer.add(_rows_of(index, views, layout))
-            for name, own in layout.stats(views[layout.cameras[0]], slice(old.length)).items():
+            writer.add(index, columns)
+            for name, own in layout.stats(columns, slice(old.length)).items():
                 stats[name].merge(own)
             source = "" if old.source == job.source else old.source
             rows.append(
@@ -163,24 +160,6 @@ def _make_shard(job: _NewSet, plan: Plan, out: Path, unit: ShardUnit, refused: S
                 )
             )
         writer.close(Footer(plan.facts, unit.name, unit.split, tuple(rows), tuple(refused), stats))
-
-
-def _rows_of(index: int, views: Mapping[str, dict[str, NDArray[Any]]], layout: RowLayout) -> EpisodeRows:
-    """Return the rows of an episode from its columns by camera."""
-    tokens = token_column(layout.tokenizer)[0]
-    first, *further = layout.token_columns.items()
-    stateless = layout.embodiment.state is None
-    own = {key: value for key, value in views[first[0]].items() if not (stateless and "state" in key)}
-    return EpisodeRows(
-        episode_index=index,
-        timestamps=own["timestamp"],
-        tokens=own[tokens],
-        actions=own["action"],
-        states=own.get("state"),
-        further={column: views[camera][tokens] for camera, column in further},
-        action_known=own.get("action_known"),
-        state_known=own.get("state_known"),
-    )
 
 
 # -- from shard sets

@@ -38,7 +38,7 @@ from hma_data.conversion.reading import (
 from hma_data.cpu import usable_cores
 from hma_data.episodes.images import prepared
 from hma_data.shards.schema import Refused, RowLayout
-from hma_data.shards.writer import EpisodeRows, ShardWriter
+from hma_data.shards.writer import ShardWriter
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
 
 FRAMES_A_BATCH = 32  # decoded and tokenized together
@@ -138,7 +138,7 @@ class ShardOutput:
                     noted.refuse(item, report)
                     continue
                 start = writer.rows
-                writer.add(_cut(item, layout))
+                writer.add(item.index, _columns(item, layout))
                 noted.add(item, start, report)
             writer.close(noted.footer())
             with signs_of_life(report):  # an upload may take longer than the limit for a hanging worker
@@ -180,8 +180,8 @@ def _tokenized(
     yield from ready()
 
 
-def _cut(item: ReadEpisode, layout: RowLayout) -> EpisodeRows:
-    """Return the episode's rows; strided rows hold the whole chunk of actions."""
+def _columns(item: ReadEpisode, layout: RowLayout) -> dict[str, NDArray[Any] | None]:
+    """Return the columns of the episode's rows; strided rows hold the whole chunk of actions."""
     clip, kept = item.clip, item.kept
     steps = len(kept) * layout.frame_stride
     actions: NDArray[np.float32] = clip.actions[:steps].reshape(len(kept), -1)
@@ -189,17 +189,14 @@ def _cut(item: ReadEpisode, layout: RowLayout) -> EpisodeRows:
     if known is not None:
         known = np.all(known[:steps].reshape(len(kept), -1), axis=1)
         actions = np.where(known[:, None], actions, np.float32(0))
-    first, *further = layout.token_columns.items()
-    return EpisodeRows(
-        episode_index=item.index,
-        timestamps=clip.timestamps[kept],
-        tokens=np.concatenate(item.tokens[first[0]]),
-        actions=actions,
-        states=None if clip.states is None else clip.states[kept],
-        further={column: np.concatenate(item.tokens[camera]) for camera, column in further},
-        action_known=known,
-        state_known=None if clip.state_known is None else clip.state_known[kept],
-    )
+    return {
+        **{column: np.concatenate(item.tokens[camera]) for camera, column in layout.token_columns.items()},
+        "timestamp": clip.timestamps[kept],
+        "action": actions,
+        "state": None if clip.states is None else clip.states[kept],
+        "action_known": known,
+        "state_known": None if clip.state_known is None else clip.state_known[kept],
+    }
 
 
 class Batches:

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -17,29 +16,6 @@ from hma_data.storage.files import atomic_path, file_sha256
 from hma_data.tokenizers.base import TokenizerSpec
 
 
-@dataclass(frozen=True)
-class EpisodeRows:
-    """The rows of one episode.
-
-    Attributes:
-        episode_index: number of the episode in the plan.
-        timestamps: (T,) seconds from the first frame.
-        tokens: (T, h, w) ids or (T, c, h, w) latents of the first camera.
-        actions: (T, A) float32; states: (T, A') or None.
-        further: column -> tokens of each further camera, shaped like `tokens`.
-        action_known, state_known: (T,), or None if all are known; written only if the shard set has masks.
-    """
-
-    episode_index: int
-    timestamps: NDArray[np.float64]
-    tokens: NDArray[Any]
-    actions: NDArray[np.float32]
-    states: NDArray[np.float32] | None
-    further: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    action_known: NDArray[np.bool_] | None = None
-    state_known: NDArray[np.bool_] | None = None
-
-
 class ShardWriter:
     """A context manager that writes a shard: `add` episodes, then `close` with the footer.
 
@@ -52,8 +28,8 @@ class ShardWriter:
 
     def __init__(self, path: Path, schema: pa.Schema, spec: TokenizerSpec) -> None:
         self._path = path
-        self._schema, (self._tokens, values) = schema, token_column(spec)
-        values *= sum(name.startswith(self._tokens) for name in schema.names)  # of all cameras
+        self._schema, (tokens, values) = schema, token_column(spec)
+        values *= sum(name.startswith(tokens) for name in schema.names)  # of all cameras
         self._group = min(ROW_GROUP, max(GROUP_VALUES // values, 1))  # rows
         self._pending: list[pa.Table] = []
         self._closed = False
@@ -78,23 +54,23 @@ class ShardWriter:
             self._atomic = opening.pop_all()
         return self
 
-    def add(self, episode: EpisodeRows) -> None:
-        """Append an episode; a row group holds whole episodes if they fit."""
-        length = len(episode.timestamps)
-        values: dict[str, NDArray[Any]] = {
-            "episode_index": np.full(length, episode.episode_index, np.int32),
-            "frame_index": np.arange(length, dtype=np.int32),
-            "timestamp": episode.timestamps,
-            self._tokens: episode.tokens,
-            **episode.further,
-            "action": episode.actions,
-        }
-        for name in ("action_known", "state_known"):
-            known = getattr(episode, name)
-            values[name] = np.ones(length, np.bool_) if known is None else known
-        if episode.states is not None:
-            values["state"] = episode.states
-        table = pa.table([to_arrow(field, values[field.name]) for field in self._schema], schema=self._schema)
+    def add(self, episode_index: int, columns: Mapping[str, NDArray[Any] | None]) -> None:
+        """Append an episode; a row group holds whole episodes if they fit.
+
+        Args:
+            episode_index: number of the episode in the plan.
+            columns: (T, …) values of the schema's columns; the two indexes are filled in, and so is a mask
+                that is missing or None, because all is known. What the schema lacks is left out.
+        """
+        numbered = dict(columns)
+        length = len(numbered["timestamp"])
+        numbered["episode_index"] = np.full(length, episode_index, np.int32)
+        numbered["frame_index"] = np.arange(length, dtype=np.int32)
+        for mask in ("action_known", "state_known"):
+            if numbered.get(mask) is None:
+                numbered[mask] = np.ones(length, np.bool_)
+        arrays = [to_arrow(field, numbered[field.name]) for field in self._schema]
+        table = pa.table(arrays, schema=self._schema)
         if self._pending and sum(map(len, self._pending)) + length > self._group:
             self._flush()
         self._pending.append(table)

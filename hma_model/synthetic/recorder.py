@@ -22,7 +22,7 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import MANIFEST, Manifest, derive
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import EpisodeRow, Footer, Refused, RowLayout, flags_text
-from hma_data.shards.writer import EpisodeRows, ShardWriter
+from hma_data.shards.writer import ShardWriter
 from hma_data.sources.base import EpisodeRef
 from hma_data.sources.lerobot import writer as lerobot_writer
 from hma_data.sources.lerobot.writer import LeRobotEpisode, write_lerobot
@@ -124,8 +124,8 @@ def write_shards(
                     )
                 )  # fmt: skip
                 views = np.split(one.stored[:length], len(layout.cameras), axis=-2)
-                further = dict(zip(list(layout.token_columns.values())[1:], views[1:], strict=True))
-                writer.add(EpisodeRows(index, times, views[0], one.chunks, None, further))
+                tokens = dict(zip(layout.token_columns.values(), views, strict=True))
+                writer.add(index, {"timestamp": times, **tokens, "action": one.chunks})
                 stats["action"].merge(layout.stats({"action": one.chunks}, slice(None))["action"])
             writer.close(Footer(plan.facts, unit.name, unit.split, tuple(rows), left, stats))
         left = ()

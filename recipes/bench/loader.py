@@ -47,7 +47,7 @@ def make_set(folder: Path, number: int, settings: dict[str, Any]) -> Path:
     from hma_data.shards.manifest import Derived, ShardFile, plan_hash
     from hma_data.shards.schema import EpisodeRow, Footer, arrow_schema, read_footer
     from hma_data.shards.stats import Stats
-    from hma_data.shards.writer import EpisodeRows, ShardWriter
+    from hma_data.shards.writer import ShardWriter
     from hma_data.storage.files import file_sha256
     from hma_data.tokenizers.base import TokenizerSpec
 
@@ -76,7 +76,8 @@ def make_set(folder: Path, number: int, settings: dict[str, Any]) -> Path:
             tokens = rng.integers(0, spec.vocab_size, (length, *spec.grid), dtype=np.uint32)
             actions = rng.standard_normal((length, dims), dtype=np.float32)
             place = (str(i), "train", names[0], writer.rows, length, length)
-            writer.add(EpisodeRows(i, np.arange(length) / robot.rate_hz, tokens, actions, None))
+            clock = np.arange(length) / robot.rate_hz
+            writer.add(i, {"timestamp": clock, "tokens": tokens, "action": actions})
             stats.merge(Stats.of(actions))
             inside.append(EpisodeRow(i, *place, "", None, "", 0.0, 0.0, 0.0, "{}", 0, ""))
         writer.close(Footer(plan, names[0], "train", tuple(inside), (), {"action": stats}))

@@ -8,9 +8,9 @@ import pyarrow.parquet as pq
 
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import derive
-from hma_data.shards.schema import EpisodeRow, Footer, arrow_schema, flags_text
+from hma_data.shards.schema import EpisodeRow, Footer, arrow_schema, flags_text, token_column
 from hma_data.shards.stats import Stats
-from hma_data.shards.writer import EpisodeRows, ShardWriter
+from hma_data.shards.writer import ShardWriter
 from hma_data.tokenizers.base import TokenizerSpec
 from tests.model.robots import SPEC, yaml
 
@@ -68,7 +68,7 @@ def make_shards(
                 if spec.kind == "continuous":
                     frames = rng.normal(size=(length, spec.channels, *spec.grid)).astype(np.float16)
                 start, clock = writer.rows, np.arange(length) / 10
-                writer.add(EpisodeRows(number, clock, frames, actions, None))
+                writer.add(number, {"timestamp": clock, token_column(spec)[0]: frames, "action": actions})
                 place = (split, path, start, length, length)
                 rows.append(EpisodeRow(number, f"e{number}", *place, "", None, "", 0, 0, 0, "{}", 0, ""))
             stats = Stats.of(np.concatenate([whole[number][1] for number in numbers]))

@@ -1,6 +1,5 @@
 """What a run survives: kills at any moment, full disks, other hands in its folder. Each fault in one line."""
 
-import dataclasses
 import errno
 import json
 from pathlib import Path
@@ -11,7 +10,7 @@ import pytest
 import torch
 
 from hma_data.errors import CheckpointError, OutputError, RecipeError, ShardError, TrainingError
-from hma_data.shards.writer import EpisodeRows, ShardWriter
+from hma_data.shards.writer import ShardWriter
 from hma_model.checkpoint import io as checkpoint
 from hma_model.checkpoint.folder import resolve, training_checkpoints
 from hma_model.training.guards import StepMetrics
@@ -123,12 +122,12 @@ def make_hurt(folder: Path) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         plain = ShardWriter.add
 
-        def add(self: ShardWriter, rows: EpisodeRows) -> None:
-            if rows.episode_index == EPISODE:
-                actions = rows.actions.copy()
+        def add(self: ShardWriter, episode_index: int, columns: dict) -> None:
+            if episode_index == EPISODE:
+                actions = columns["action"].copy()
                 actions[ROW, 0] = np.float32(3e38)
-                rows = dataclasses.replace(rows, actions=actions)
-            plain(self, rows)
+                columns = columns | {"action": actions}
+            plain(self, episode_index, columns)
 
         patch.setattr(ShardWriter, "add", add)
         return make_shards(folder, "arm")
