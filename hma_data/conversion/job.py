@@ -284,8 +284,6 @@ class _Run:
         """
         given = self.given
         base = self.holder.base()
-        if base is not None:
-            self._check_stride(base)
         if base is None or not (given.extend or "extends" in base.plan):
             return self.whole, None
         source = open_source(given.embodiment.source.format)
@@ -298,21 +296,6 @@ class _Run:
             fault = f"lacks {plan.episodes:,} episodes that the recording has now"
             raise OtherPlanError(self.folder, fault, "--extend adds them")
         return plan, base
-
-    def _check_stride(self, base: Manifest) -> None:
-        """Refuse another stride for a strided set; its rows hold the action chunks of one stride."""
-        embodiment = self.given.embodiment
-        if self.given.settings.frames != "strided" or base.plan.get("frames") != "strided":
-            return
-        if base.plan.get("embodiment_hash") != embodiment.digest:
-            return  # what else differs is told where the plans are compared
-        stride = base.frame_stride
-        if stride != embodiment.stride:
-            fault = (
-                f"has rows of stride {stride} (--frames strided), the YAML gives stride {embodiment.stride}"
-            )
-            remedy = f"set stride: {stride} in the YAML, choose another --out, or --overwrite to start over"
-            raise OutputError(self.folder, fault, remedy)
 
     def make(self, plan: Plan, base: Manifest | None, share: Share | None, on_progress: OnProgress) -> None:
         """Make the shards that are missing."""

@@ -274,7 +274,7 @@ def test_rows_of_another_stride_are_refused_and_nothing_is_touched(toy_recording
     out, settings = tmp_path / "out", replace(SMALL, frames="strided")
     run(robot(), toy_recording, out, settings)
     before = contents(out)
-    said = r"has rows of stride 2 \(--frames strided\), the YAML gives stride 10.*set stride: 2.*--overwrite"
+    said = r"different: recorded steps a row, with --frames strided the YAML's stride \(2 there, 10 now\) — "
     for options in ({}, {"extend": True}):
         with pytest.raises(OutputError, match=said):
             run(robot(1), toy_recording, out, settings, **options)
@@ -284,6 +284,9 @@ def test_rows_of_another_stride_are_refused_and_nothing_is_touched(toy_recording
     assert contents(out) == before
     kept = run(robot(1, "stride: 2\n"), toy_recording, out, settings)
     assert kept.changed == "new from the YAML: target_hz, stride" and verify(out) == []
+    (out / "manifest.json").unlink()  # as of a job that was killed
+    with pytest.raises(OutputError, match=said):
+        run(robot(1), toy_recording, out, settings)
 
 
 def test_other_settings_are_refused_before_the_stride_is_written(toy_recording, tmp_path) -> None:
