@@ -2,6 +2,7 @@
 
 import shlex
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -52,14 +53,15 @@ def registry_list(
     broken = []
     for entry in entries():
         if entry.facts is None:
-            broken += [f"{entry.path}: {_line(problem)}" for problem in entry.problems]
+            broken += [f"{entry.path}: {problem}" for problem in entry.problems]
         else:
             found.setdefault(entry.facts["id"], entry.facts)
-    rows = [
-        row
-        for _, row in sorted(found.items())
-        if (source is None or row["format"] == source) and _mentions(row, words or [])
-    ]
+    rows = []
+    for _, row in sorted(found.items()):
+        text = f"{row['id']} {row['robot']} {row['description']}".lower()
+        mentioned = all(word.lower() in text for word in words or [])
+        if mentioned and (source is None or row["format"] == source):
+            rows.append(row)
     if json:
         print_json(rows)
     else:
@@ -73,11 +75,6 @@ def registry_list(
     for line in broken:
         say(f"not listed: {line}", err=True)
     raise typer.Exit(1 if broken else 0)
-
-
-def _mentions(row: dict[str, Any], words: list[str]) -> bool:
-    text = f"{row['id']} {row['robot']} {row['description']}".lower()
-    return all(word.lower() in text for word in words)
 
 
 @registry_app.command("show")
@@ -130,12 +127,12 @@ def registry_validate(
     judged = entries(files if paths else None)
     found = [(entry, problem) for entry in judged for problem in entry.problems]
     if json:
-        listed = [{"file": str(entry.path), "problem": _line(problem), **problem} for entry, problem in found]
+        listed = [{"file": str(entry.path), "problem": str(one), **asdict(one)} for entry, one in found]
         notes = [{"file": str(path), "note": note} for path, note in _notes(judged)]
         print_json({"files": len(judged), "problems": listed, "notes": notes})
     else:
         for entry, problem in found:
-            say(f"{entry.path}: {_line(problem)}")
+            say(f"{entry.path}: {problem}")
         for path, note in _notes(judged):
             say(f"{path}: note: {note}")
         say(f"{human_count(len(judged), 'file')}, {human_count(len(found), 'problem')}")
@@ -153,12 +150,6 @@ def _notes(judged: "list[RegistryEntry]") -> Iterator[tuple[Path, str]]:
             sees = f"the model sees {rate / (stride or 1):.4g} frames a second"
             given = f" with the stride {stride} that is given" if stride and stride > 1 else ""
             yield entry.path, f"target_hz {target:g} is above the recorded rate: {sees}{given}"
-
-
-def _line(problem: dict[str, str | None]) -> str:
-    from hma_data.registry.embodiment import Problem
-
-    return str(Problem(**problem))  # type: ignore[arg-type]  # path and fault are texts
 
 
 @registry_app.command("schema")

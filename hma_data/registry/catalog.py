@@ -9,7 +9,7 @@ import hashlib
 import json
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from hma_data.registry import FORMATS
 from hma_data.registry.folders import file_id, registry_files, registry_folders
 from hma_data.storage.files import cache_folder, write_atomic
 from hma_data.storage.paths import StrPath, as_path
-from hma_data.storage.yaml_io import decode_yaml, parse_yaml, read_bytes
+from hma_data.storage.yaml_io import Problem, decode_yaml, parse_yaml, read_bytes
 
 
 @dataclass(frozen=True)
@@ -29,13 +29,13 @@ class RegistryEntry:
     Attributes:
         path: of the file.
         facts: what `hma registry list` shows of it; None where it has problems.
-        problems: the fields of `hma_data.registry.embodiment.Problem`: path, fault, value, allowed.
+        problems: everything that is wrong with it.
         name: the id that the file states, also where it has problems; None where it states none.
     """
 
     path: Path
     facts: dict[str, Any] | None
-    problems: tuple[dict[str, str | None], ...]
+    problems: tuple[Problem, ...]
     name: str | None
 
 
@@ -64,7 +64,8 @@ def _entry(path: Path, cache: "_Cache") -> RegistryEntry:
         found = cache.judgement(read_bytes(path), path)
     except HMAError as fault:
         found = _unreadable(fault)
-    return RegistryEntry(path, found["facts"], tuple(found["problems"]), found["name"])
+    problems = tuple(Problem(**problem) for problem in found["problems"])
+    return RegistryEntry(path, found["facts"], problems, found["name"])
 
 
 def _judge(content: bytes, path: Path) -> dict[str, Any]:
@@ -112,13 +113,12 @@ def facts(embodiment: Any) -> dict[str, Any]:
 
 
 def _unreadable(fault: HMAError) -> dict[str, Any]:
-    problem = {"path": "", "fault": fault.fault, "value": None, "allowed": None}
-    return {"facts": None, "problems": [problem], "name": None}
+    return {"facts": None, "problems": [asdict(Problem("", fault.fault))], "name": None}
 
 
 def _with(entry: RegistryEntry, fault: str) -> RegistryEntry:
-    problem = {"path": "id", "fault": fault, "value": repr(entry.name), "allowed": None}
-    return RegistryEntry(entry.path, None, (*entry.problems, problem), entry.name)
+    problems = (*entry.problems, Problem("id", fault, repr(entry.name)))
+    return replace(entry, facts=None, problems=problems)
 
 
 def _doubles(found: list[RegistryEntry]) -> list[RegistryEntry]:

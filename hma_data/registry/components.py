@@ -30,6 +30,7 @@ Representation = Literal[
 ]
 Gripper = Literal["open_is_high", "open_is_low", "opening_is_high", "closing_is_high"]
 Method = Literal["nearest", "hold", "interpolate"]
+Stamp = Literal["header", "receive"]
 Verdict = Literal["refuse", "flag"]
 Pattern = Annotated[str, Field(min_length=1)]
 
@@ -93,7 +94,7 @@ class Component(SpecModel):
         None,
         description="meaning of a high value; opening_ and closing_is_high are for relative actions",
     )
-    stamp: Literal["header", "receive"] | None = Field(None, description="overrides `sync.stamp`")
+    stamp: Stamp | None = Field(None, description="overrides `sync.stamp`")
 
     @field_validator("slice", "names", "sign", "offset")
     @classmethod
@@ -165,7 +166,7 @@ class Camera(SpecModel):
     crop: tuple[Start, Start, Positive, Positive] | None = Field(
         None, description="[x, y, width, height] in pixels, after flip and rotate"
     )
-    stamp: Literal["header", "receive"] | None = Field(None, description="overrides `sync.stamp`")
+    stamp: Stamp | None = Field(None, description="overrides `sync.stamp`")
     levels: tuple[Number, Number] | None = Field(
         None, description="[black, white] of a bag's 16-bit grey images: the values mapped to 0 and 255"
     )
@@ -203,7 +204,7 @@ class Sync(SpecModel):
         le=100,
         description="in steps: the action of frame t is recorded at t + action_shift; not for bags, RH20T",
     )
-    stamp: Literal["header", "receive"] = Field("header", description="which timestamp of a message to use")
+    stamp: Stamp = Field("header", description="which timestamp of a message to use")
 
     @field_validator("beyond")
     @classmethod

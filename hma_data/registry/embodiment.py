@@ -12,7 +12,6 @@ import math
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, Self
 
@@ -37,7 +36,7 @@ from hma_data.registry.components import (
 from hma_data.registry.folders import file_id, registry_files, registry_folders
 from hma_data.storage.kinds import misplaced
 from hma_data.storage.paths import StrPath, as_path, as_text
-from hma_data.storage.yaml_io import parse_yaml, plain_fault, read_yaml, write_yaml
+from hma_data.storage.yaml_io import Problem, parse_yaml, plain_fault, read_yaml, write_yaml
 
 if TYPE_CHECKING:
     import numpy as np
@@ -291,22 +290,6 @@ class Embodiment(SpecModel):
         if found:
             raise RegistryError(where, "; ".join(found), "hma registry schema prints what is allowed")
         return cls.model_validate(values)
-
-
-@dataclass(frozen=True)
-class Problem:
-    """One problem of a YAML: its path in the YAML, the fault, the value found, and what is allowed there."""
-
-    path: str
-    fault: str
-    value: str | None = None
-    allowed: str | None = None
-
-    def __str__(self) -> str:
-        text = f"{self.path}: {self.fault}" if self.path else self.fault
-        if self.value is not None:
-            text += f" (is {self.value})"
-        return text + (f"; allowed: {self.allowed}" if self.allowed else "")
 
 
 def problems(values: Any) -> list[str]:

@@ -34,10 +34,7 @@ def modality(embodiment: Embodiment) -> dict[str, Any]:
     values: dict[str, Any] = {
         "state": _modalities(embodiment.state, "observation.state", own, delta=False),
         "action": _modalities(embodiment.action, "action", own, delta=delta),
-        "video": {
-            camera.name: {"original_key": camera.key if own else f"observation.images.{camera.name}"}
-            for camera in embodiment.cameras
-        },
+        "video": {name: {"original_key": key} for name, key in camera_features(embodiment).items()},
     }
     if own or embodiment.source.instruction:
         values["annotation"] = {"human.task_description": {"original_key": "task_index"}}
@@ -98,18 +95,23 @@ def lerobot_features(embodiment: Embodiment) -> dict[str, dict[str, Any]]:
     Returns:
         feature -> dtype, shape and names, as `LeRobotDataset.create(features=…)` takes it.
     """
-    own = embodiment.source.format == "lerobot"
+    keys = camera_features(embodiment)
     features = {"action": _vector_feature(embodiment.action)}
     if embodiment.state:
         features["observation.state"] = _vector_feature(embodiment.state)
     for camera in embodiment.cameras:
-        key = camera.key if own else f"observation.images.{camera.name}"
-        features[key] = {
+        features[keys[camera.name]] = {
             "dtype": "video",
             "shape": (*(camera.size or PICTURE), 3),
             "names": ["height", "width", "channels"],
         }
     return features
+
+
+def camera_features(embodiment: Embodiment) -> dict[str, str]:
+    """Return camera -> the feature of its pictures: of a LeRobot recording, the recording's own."""
+    own = embodiment.source.format == "lerobot"
+    return {one.name: one.key if own else f"observation.images.{one.name}" for one in embodiment.cameras}
 
 
 def _vector_feature(vector: Vector) -> dict[str, Any]:

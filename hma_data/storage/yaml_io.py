@@ -6,6 +6,7 @@ times as fast); the rules for what is accepted are the same either way.
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -135,6 +136,22 @@ def decode_yaml(content: bytes, path: Path, error: type[HMAError] = RegistryErro
     except UnicodeDecodeError as fault:
         found = misplaced(path, "a YAML file")
         raise error(path, *(found or (f"is not UTF-8 text: {fault}",))) from fault
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One problem of a YAML: its path in the YAML, the fault, the value found, and what is allowed there."""
+
+    path: str
+    fault: str
+    value: str | None = None
+    allowed: str | None = None
+
+    def __str__(self) -> str:
+        text = f"{self.path}: {self.fault}" if self.path else self.fault
+        if self.value is not None:
+            text += f" (is {self.value})"
+        return text + (f"; allowed: {self.allowed}" if self.allowed else "")
 
 
 def plain_fault(item: Mapping[str, Any]) -> str:

@@ -37,7 +37,7 @@ def put(folder: Path, name: str, id: str | None = None, hz: Any = 10) -> Path:
 
 def own(folder: Path) -> dict[str, Any]:
     return {
-        entry.path.stem: entry.facts or [problem["fault"] for problem in entry.problems]
+        entry.path.stem: entry.facts or [problem.fault for problem in entry.problems]
         for entry in entries()
         if folder in entry.path.parents
     }
@@ -86,7 +86,7 @@ def test_two_files_with_one_id_are_named(folder: Path) -> None:
     put(folder, "other", id="arm")
     found = [entry for entry in entries() if entry.name == "arm"]
     assert sum(entry.facts is not None for entry in found) == 1
-    faults = [problem["fault"] for entry in found for problem in entry.problems]
+    faults = [problem.fault for entry in found for problem in entry.problems]
     assert len(faults) == 2 and all(fault.startswith("is also the id of") for fault in faults)
 
 
