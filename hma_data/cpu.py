@@ -14,6 +14,10 @@ nothing (`hma_model.generation.engine`). `hma bench waiting` compares the choice
 
 import ctypes
 import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
 
 SPINS = 1_000  # turns of the loop: on a quiet machine nearly as quick as more, on a busy one as PASSIVE
 M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_MAX = -1, -2, -4  # of glibc's malloc.h
@@ -45,6 +49,22 @@ def keep_freed_memory() -> None:
         mallopt(M_MMAP_MAX, 0)  # no array is mapped by itself
         mallopt(M_TRIM_THRESHOLD, -1)  # nothing is returned
         mallopt(M_TOP_PAD, 2**26)
+
+
+def in_order[T, R](act: Callable[[T], R], items: Iterable[T], threads: int) -> Iterator[tuple[T, R]]:
+    """Yield each item with what `act` returns of it, in their order; threads work a few items ahead.
+
+    The first error ends it: items that no thread has begun are left out.
+    """
+    left, pool = iter(items), ThreadPoolExecutor(threads)
+    try:
+        begun = deque((item, pool.submit(act, item)) for item in islice(left, 2 * threads))
+        while begun:
+            item, result = begun.popleft()
+            yield item, result.result()
+            begun.extend((item, pool.submit(act, item)) for item in islice(left, 1))
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def usable_cores() -> int:

@@ -86,7 +86,7 @@ def extended(
     columns = ["id", "fingerprint", "content"]
     if killed:
         hashes = {shard.path: shard.sha256 for shard in base.shards}
-        there = derive(out, list(hashes), base.embodiment, base.tokenizer, base.plan, base.source, hashes)
+        there = derive(out, list(hashes), base.embodiment, base.plan, base.source, hashes)
         known, lines = there.episodes.select(columns), there.quarantine.splitlines()
     else:
         known = parquet_file(out / EPISODES).read(columns=columns)
@@ -95,19 +95,13 @@ def extended(
     now = plan.table()
     place = pc.index_in(now["id"], known["id"])  # null for episodes that the set does not have
     other = now.filter(pc.not_equal(now["fingerprint"], known["fingerprint"].take(place)))
-    _refuse_changed(out, Records(EpisodeRef, other), _contents(known, other["id"]), content)
+    before = known.filter(pc.is_in(known["id"], other["id"].combine_chunks()))
+    contents = dict(zip(before["id"].to_pylist(), before["content"].to_pylist()))
+    _refuse_changed(out, Records(EpisodeRef, other), contents, content)
     new = now.filter(pc.and_not(pc.is_null(place), pc.is_in(now["id"], refused)))
     if not len(new):
         return Plan((), base.plan)
     return _with(base, Records(EpisodeRef, new), len(known) + len(refused), shard_frames)
-
-
-def _contents(known: pa.Table, ids: pa.ChunkedArray) -> dict[str, str]:
-    """Return id -> hash of the content, of these ids."""
-    if not len(ids):
-        return {}
-    some = known.filter(pc.is_in(known["id"], ids.combine_chunks()))
-    return dict(zip(some["id"].to_pylist(), some["content"].to_pylist()))
 
 
 def _is_killed_extension(out: Path, base: Manifest) -> bool:

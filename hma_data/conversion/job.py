@@ -31,13 +31,11 @@ from hma_data.conversion.report import (
     Summary,
     UnfinishedShare,
     held_out_line,
-    rate_warning,
     refusal_reasons,
     training_notes,
 )
 from hma_data.conversion.settings import Options, Settings
 from hma_data.conversion.worker import MakeWork
-from hma_data.episodes.align import OFF_RATE
 from hma_data.errors import (
     OtherPlanError,
     OutputError,
@@ -253,11 +251,9 @@ class _Run:
             self.whole = dataset_plan(shards.whole, self.uri, given.embodiment)
         else:
             self.whole, self.uri = given.plan(self._spec)
-        if given.to == "lerobot":
-            self.holder: ShardHolder | LeRobotHolder = LeRobotHolder(self.out, given.embodiment, self.uri)
-        else:
-            folder = self.hub.staging if self.hub else self.out
-            self.holder = ShardHolder(folder, given.embodiment, self._spec, self.uri)
+        hold: type[ShardHolder | LeRobotHolder] = LeRobotHolder if given.to == "lerobot" else ShardHolder
+        folder = self.hub.staging if self.hub else self.out
+        self.holder = hold(folder, given.embodiment, self.uri)
         self.folder = self.holder.folder
         self.frame_sizes: dict[str, tuple[int, int]] = {}
         self.kept = self.made = 0  # units that were there, and that this run has made
@@ -369,8 +365,7 @@ class _Run:
         folder, out = self.folder, self.out
         done = self.holder.finish(plan, base, changed)
         manifest, reasons = done.manifest, refusal_reasons(done.refused)
-        episodes = sum(split["episodes"] for split in manifest.splits.values())
-        if not episodes:
+        if not manifest.episodes:
             self.holder.clear()
             if self.beside:
                 self.beside.holder.clear()
@@ -378,11 +373,10 @@ class _Run:
             told = "; ".join(f"{count} × {reason}" for reason, count in worst)
             raise SourceError(self.uri, f"gave no usable episode, so nothing was written: {told}")
         shards = self.given.to == "shards"
-        warning = rate_warning(folder, out) if shards and OFF_RATE in done.flags else ""
-        notes = training_notes(folder, out, plan) if shards else ()
+        warning, *notes = training_notes(folder, out, plan) if shards else [""]
         if self.hub:
             self.hub.upload()
-        most = self.given.max_quarantine * (episodes + manifest.quarantined)
+        most = self.given.max_quarantine * (manifest.episodes + manifest.quarantined)
         return Summary(
             out=out,
             manifest=manifest,
@@ -396,7 +390,7 @@ class _Run:
             left_out=self.whole.left_out,
             changed=done.news,
             warning=warning,
-            notes=notes,
+            notes=tuple(notes),
             held_out=held_out_line(manifest, self.whole)
             if shards or manifest.splits["val"]["episodes"]
             else "",

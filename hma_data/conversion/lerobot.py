@@ -45,7 +45,7 @@ from hma_data.episodes.episode import Clip
 from hma_data.episodes.images import prepare, upright
 from hma_data.errors import EpisodeError, HMAError, OutputError, ShardError, SourceError, UsageError
 from hma_data.registry.embodiment import ONE_INDEX, Embodiment
-from hma_data.registry.export import lerobot_features, packed_components
+from hma_data.registry.export import camera_features, lerobot_features, packed_components
 from hma_data.shards.manifest import EMBODIMENT, EPISODES, QUARANTINE, Derived, Manifest, ShardFile
 from hma_data.shards.schema import FOOTER_KEY, Footer, Refused, RowLayout, mask_columns, to_numpy
 from hma_data.sources.base import open_source
@@ -130,9 +130,8 @@ class Columns:
     @cached_property
     def keys(self) -> dict[str, str]:
         """Return camera -> feature: the recording's own for a LeRobotDataset."""
-        cameras = [self.layout.embodiment.camera(name) for name in self.layout.cameras]
-        own = self.layout.embodiment.source.format == "lerobot"
-        return {one.name: one.key if own else f"observation.images.{one.name}" for one in cameras}
+        keys = camera_features(self.layout.embodiment)
+        return {name: keys[name] for name in self.layout.cameras}
 
     @cached_property
     def features(self) -> dict[str, dict[str, Any]]:
@@ -249,7 +248,14 @@ class LeRobotOutput:
             camera = self._job.embodiment.camera(name)
             raw = clip.frames_at(name, rows)
             frames = np.ascontiguousarray(upright(raw, camera))
-            _check_size(episode.ref.id, name, frames, facts["sizes"][name])
+            height, width = facts["sizes"][name]
+            if frames.shape[1:3] != (height, width):
+                own = f"{frames.shape[2]}×{frames.shape[1]}"
+                fault = (
+                    f"camera {name} has frames of {own} pixels, the dataset's first episode {width}×{height}"
+                )
+                remedy = "convert such episodes into a dataset of their own, with --only"
+                raise EpisodeError(episode.ref.id, fault, remedy)
             return frames, prepare(raw, camera, CHECKED)
 
         yield from frames_of(self._job, episode, self.batch, report, show)
@@ -335,13 +341,6 @@ class PartWriter:
         self._rows += count
         self._report(Tick(frames=count * len(self._waiting)))
         self._waiting = {}
-
-
-def _check_size(episode_id: str, camera: str, frames: NDArray[np.uint8], size: list[int]) -> None:
-    if list(frames.shape[1:3]) != size:
-        said = f"{frames.shape[2]}×{frames.shape[1]} pixels, the dataset's first episode {size[1]}×{size[0]}"
-        remedy = "convert such episodes into a dataset of their own, with --only"
-        raise EpisodeError(episode_id, f"camera {camera} has frames of {said}", remedy)
 
 
 @contextmanager
@@ -437,7 +436,7 @@ class LeRobotHolder:
         return Finished.of(self.out, dataset, _bytes(self.out))
 
     def _derived(self, plan: Plan) -> Derived:
-        derived = Derived(plan.facts, self._robot, AS_RECORDED, self._uri)
+        derived = Derived(plan.facts, self._robot, self._uri)
         for unit in plan.units:
             footer = _footer(part_folder(self.folder, unit.name))
             rows = sum(footer.table["rows"].to_pylist())

@@ -7,7 +7,6 @@ import json
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any
 
 from hma_data.conversion.extend import ways
 from hma_data.conversion.plan import Plan, differences
+from hma_data.cpu import in_order
 from hma_data.errors import HMAError, OtherPlanError, OutputError, RegistryError, StorageAwayError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import (
@@ -35,7 +35,6 @@ from hma_data.shards.schema import PLAN_HASH, Footer, flag_totals, read_metadata
 from hma_data.storage.files import PART, remove_parts
 from hma_data.storage.locks import LOCK
 from hma_data.storage.remote import RemotePath, create_bytes, is_remote, parquet_file, put_bytes
-from hma_data.tokenizers.base import TokenizerSpec
 
 _, JOURNAL, PLAN = WORKING
 READERS, JOURNAL_S = 16, 20.0  # in a store: footers read at a time, seconds between writes of a journal
@@ -90,9 +89,9 @@ class ShardHolder:
         folder: of the units; one job at a time writes it.
     """
 
-    def __init__(self, folder: Path, embodiment: Embodiment, spec: TokenizerSpec, uri: str) -> None:
+    def __init__(self, folder: Path, embodiment: Embodiment, uri: str) -> None:
         self.folder = folder
-        self._embodiment, self._spec, self._uri = embodiment, spec, uri
+        self._embodiment, self._uri = embodiment, uri
 
     def clear(self) -> None:
         """Delete the shard set; keep what lies beside it.
@@ -115,8 +114,41 @@ class ShardHolder:
         return Manifest.load(self.folder) if (self.folder / MANIFEST).is_file() else None
 
     def finished(self, plan: Plan, base: Manifest | None, shared: bool) -> set[str]:
-        """Return the names of the plan's shards that are there and whole; see `finished_shards`."""
-        return finished_shards(self.folder, plan, base, shared)
+        """Return the names of the plan's shards that are there and whole; claim a folder of a store for it.
+
+        Args:
+            base: the set that the plan extends; its shards may be there too.
+            shared: True where other jobs may be writing: unfinished files are then not deleted.
+        """
+        out = self.folder
+        _refuse_foreign(out)
+        if isinstance(out, RemotePath):
+            _refuse_claimed(out, plan)
+        if not shared:
+            remove_parts(out)
+        kept = {shard.path for shard in base.shards} if base else set()
+        planned = {unit.name for unit in plan.units}
+        done: set[str] = set()
+
+        def look(name: str) -> dict[bytes, bytes]:
+            return read_metadata(out / name).metadata or {}
+
+        readers = READERS if is_remote(out) else 1
+        for name, metadata in in_order(look, sorted(shard_sizes(out).keys() - kept), readers):
+            if name in planned and metadata.get(PLAN_HASH) == plan.facts["hash"].encode():
+                done.add(name)
+                continue
+            footer = Footer.from_metadata(metadata, str(out / name))
+            if base and footer.plan.get("extends") and plan_hashes(base.plan) & plan_hashes(footer.plan):
+                (out / name).unlink()  # of an unfinished extension that differs from this one
+            else:
+                raise other_plan(out, plan.facts, footer.plan)
+        if not done and base is None and (out / MANIFEST).is_file():
+            refuse_other(out, plan)
+        if isinstance(out, RemotePath) and done != planned:
+            create_bytes(json.dumps(plan.facts).encode(), out / PLAN)
+            _refuse_claimed(out, plan)  # two jobs may have come at once
+        return done
 
     @contextmanager
     def noting(self, share: "Share | None") -> Iterator[Callable[["Made"], None]]:
@@ -149,7 +181,7 @@ class ShardHolder:
                 kept = before.shards  # their hashes are known
         names = list(dict.fromkeys([*(shard.path for shard in kept), *(unit.name for unit in plan.units)]))
         known = {shard.path: shard.sha256 for shard in kept} | known_hashes(folder)
-        derived = derive(folder, names, embodiment, self._spec, plan.facts, self._uri, hashes=known)
+        derived = derive(folder, names, embodiment, plan.facts, self._uri, hashes=known)
         manifest = derived.write(folder)
         remove_notes(folder)
         return manifest, news
@@ -184,38 +216,6 @@ def _refuse_foreign(out: Path) -> None:
         raise OutputError(out, fault, "choose an empty or new --out")
 
 
-def finished_shards(out: Path, plan: Plan, base: Manifest | None, shared: bool) -> set[str]:
-    """Return the names of the plan's shards that are there and whole; claim a folder of a store for the plan.
-
-    Args:
-        base: the set that the plan extends; its shards may be there too.
-        shared: True where other jobs may be writing: unfinished files are then not deleted.
-    """
-    _refuse_foreign(out)
-    if isinstance(out, RemotePath):
-        _refuse_claimed(out, plan)
-    if not shared:
-        remove_parts(out)
-    kept = {shard.path for shard in base.shards} if base else set()
-    planned = {unit.name for unit in plan.units}
-    done: set[str] = set()
-    for name, metadata in _metadata(out, sorted(shard_sizes(out).keys() - kept)):
-        if name in planned and metadata.get(PLAN_HASH) == plan.facts["hash"].encode():
-            done.add(name)
-            continue
-        footer = Footer.from_metadata(metadata, str(out / name))
-        if base and footer.plan.get("extends") and plan_hashes(base.plan) & plan_hashes(footer.plan):
-            (out / name).unlink()  # of an unfinished extension that differs from this one
-        else:
-            raise other_plan(out, plan.facts, footer.plan)
-    if not done and base is None and (out / MANIFEST).is_file():
-        refuse_other(out, plan)
-    if isinstance(out, RemotePath) and done != planned:
-        create_bytes(json.dumps(plan.facts).encode(), out / PLAN)
-        _refuse_claimed(out, plan)  # two jobs may have come at once
-    return done
-
-
 def refuse_other(out: Path, plan: Plan) -> None:
     """Raise OutputError unless the set in a folder is of this plan, or of one that it extends."""
     theirs = Manifest.load(out).plan
@@ -237,15 +237,6 @@ def _refuse_claimed(out: RemotePath, plan: Plan) -> None:
         fault = f"another conversion is being written there; different: {differences(plan.facts, theirs)}"
         remedy = f"wait for it, or choose another --out; if no such job runs any more, delete {out / PLAN}"
         raise OutputError(out, fault, remedy)
-
-
-def _metadata(out: Path, names: list[str]) -> Iterator[tuple[str, dict[bytes, bytes]]]:
-    """Yield the key-value metadata of each shard; in a store, read many at a time because each is slow."""
-    readers = READERS if is_remote(out) else 1
-    with ThreadPoolExecutor(readers) as pool:
-        for start in range(0, len(names), 4 * readers):
-            some = names[start : start + 4 * readers]
-            yield from zip(some, pool.map(lambda name: read_metadata(out / name).metadata or {}, some))
 
 
 def other_plan(out: Path, ours: dict[str, Any], theirs: dict[str, Any]) -> OtherPlanError:

@@ -120,22 +120,26 @@ class Counter:
         self._on_progress(self._progress)
 
 
-def training_notes(folder: Path, out: Path, plan: Plan) -> tuple[str, ...]:
-    """Return what to mend before training: no window, pauses, no episode for validation."""
+def training_notes(folder: Path, out: Path, plan: Plan) -> list[str]:
+    """Return what to mend before training.
+
+    First another rate than the YAML states, empty if there is none; then no window, pauses, an empty val.
+    """
     made = ShardSet(folder)
+    off_rate = rate_finding(made)
     found = (window_finding(made), pause_finding(made))
-    notes = [f"{out}: {one}" for one in found if one and one.severity != "info"]
+    notes = [f"{out}: {off_rate}" if off_rate else ""]
+    notes += [f"{out}: {one}" for one in found if one and one.severity != "info"]
     if fault := _empty_val(made.manifest, plan):
         notes.append(f"{out}: val is empty: {fault}")
-    return tuple(notes)
+    return notes
 
 
 def held_out_line(manifest: Manifest, plan: Plan) -> str:
     """Return how many episodes are held out for validation, and by what rule."""
     count = manifest.splits["val"]["episodes"]
-    total = count + manifest.splits["train"]["episodes"]
     fraction = plan.facts["settings"]["val_fraction"]
-    said = f"{count:,} of {human_count(total, 'episode')} held out for validation, "
+    said = f"{count:,} of {human_count(manifest.episodes, 'episode')} held out for validation, "
     if plan.own_split:
         said += "by the recording's own split, which takes precedence over --val-fraction"
     elif fraction is None:
@@ -158,12 +162,6 @@ def _empty_val(manifest: Manifest, plan: Plan) -> str:
         fault = f"the recording's own split puts the first {plan.episodes:,} episodes in train"
         return f"{fault}; use a larger --limit"
     return "all episodes belong to one group, or to train in the recording's own split"
-
-
-def rate_warning(folder: Path, out: Path) -> str:
-    """Return the fault and the remedy where episodes have another rate than the YAML states; else empty."""
-    finding = rate_finding(ShardSet(folder))
-    return f"{out}: {finding}" if finding else ""
 
 
 def refusal_reasons(refused: Iterable[Mapping[str, Any]]) -> dict[str, int]:

@@ -8,7 +8,6 @@ T frames of an episode, A values of an action.
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -20,8 +19,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from hma_data.conversion.output import finished_shards, remove_notes
+from hma_data.conversion.output import ShardHolder
 from hma_data.conversion.plan import Plan, Settings, ShardUnit, make_plan
+from hma_data.cpu import in_order
 from hma_data.errors import HMAError, ShardError, UsageError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import (
@@ -46,14 +46,13 @@ from hma_data.shards.schema import (
     read_footer,
     to_numpy,
 )
-from hma_data.shards.verify import REMAKE, OnProgress, shard_problems
+from hma_data.shards.verify import REMAKE, OnProgress, checked_shards
 from hma_data.shards.writer import ShardWriter
 from hma_data.sources.base import EpisodeRef
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath
 from hma_data.storage.records import Records, with_columns
 from hma_data.storage.remote import parquet_input, place
-from hma_data.tokenizers.base import TokenizerSpec
 
 CONVERT_AGAIN = "run the same hma convert again"
 SYNTHETIC_MARKS = (
@@ -105,29 +104,21 @@ class _NewSet:
 
     def run(self, out: StrPath, workers: int, on_progress: OnProgress) -> Manifest:
         """Write the set; keep shards that are already there."""
-        plan, out, first = self.plan(), place(out), self.sets[0]
+        plan, holder = self.plan(), ShardHolder(place(out), self.embodiment, self.source)
         whole = replace(self, episodes=self.episodes.combine_chunks())  # else each `take` combines them
-        with locked(out):
-            done = finished_shards(out, plan, None, False)
+        with locked(holder.folder):
+            done = holder.finished(plan, None, False)
             todo = [unit for unit in plan.units if unit.name not in done]
-            if not todo and (out / MANIFEST).is_file() and (out / EPISODES).is_file():
-                return Manifest.load(out)
             written = plan.frames - sum(unit.frames for unit in todo)
 
-            def make(unit: ShardUnit) -> int:
+            def make(unit: ShardUnit) -> None:
                 refused = self.refused if unit is plan.units[0] else ()
-                _make_shard(whole, plan, out, unit, refused)
-                return unit.frames
+                _make_shard(whole, plan, holder.folder, unit, refused)
 
-            with ThreadPoolExecutor(workers) as pool:
-                for frames in pool.map(make, todo):
-                    written += frames
-                    on_progress(written, plan.frames)
-            names = [unit.name for unit in plan.units]
-            derived = derive(out, names, self.embodiment, first.spec, plan.facts, self.source)
-            manifest = derived.write(out)
-            remove_notes(out)
-            return manifest
+            for unit, _ in in_order(make, todo, workers):
+                written += unit.frames
+                on_progress(written, plan.frames)
+            return holder.finish(plan, None, bool(todo)).manifest
 
 
 def _make_shard(job: _NewSet, plan: Plan, out: Path, unit: ShardUnit, refused: Sequence[Refused]) -> None:
@@ -374,11 +365,11 @@ def restat(
         known = _whole_manifest(folder)
         if known:
             hashes = {shard.path: shard.sha256 for shard in known.shards}
-            own = known.embodiment, known.tokenizer, known.plan, known.source
-            derived = derive(folder, list(hashes), *own, hashes)
+            derived = derive(folder, list(hashes), known.embodiment, known.plan, known.source, hashes)
         else:
             derived = _as_found(folder)
-        if problems := shard_problems(folder, derived.manifest, workers, on_progress):
+        checked = checked_shards(folder, derived.manifest, workers, False, on_progress)
+        if problems := [problem for _, some, _ in checked for problem in some]:
             more = f", and {len(problems) - 1} more problems" if len(problems) > 1 else ""
             raise ShardError("", problems[0] + more)
         return derived.write(folder)
@@ -401,11 +392,10 @@ def _as_found(folder: Path) -> Derived:
     for name, footer in zip(names, footers):
         if footer.plan["hash"] not in plan_hashes(plan) or footer.name != name:
             raise ShardError(folder / name, "belongs to another conversion than the other shards", REMAKE)
-    embodiment, spec = stored_embodiment(folder), TokenizerSpec.from_json(plan["tokenizer"])
-    listed = _listed(folder)
+    embodiment, listed = stored_embodiment(folder), _listed(folder)
     own = {row.episode_index for footer in footers for row in footer.episodes if not row.source}
     said = (row["source"] for row in listed.to_pylist() if row["episode_index"] in own) if listed else ()
-    derived = derive(folder, names, embodiment, spec, plan, next(iter(said), "unknown"))
+    derived = derive(folder, names, embodiment, plan, next(iter(said), "unknown"))
     counts = Counter(footer.split for footer in footers)
     gapless = names == [f"{split}/shard-{i:05d}.parquet" for split in SPLITS for i in range(counts[split])]
     # the plan's digest holds unless an episode is in quarantine

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.episodes.images import Images, opencv
-from hma_data.storage.files import atomic_path
+from hma_data.storage.files import atomic_path, write_atomic
 
 CELL = 128  # pixels of a side of a picture in a sample, about
 GAP, LABEL = 4, 18  # pixels between the pictures of a grid, and of a row's label
@@ -161,8 +161,7 @@ def gif_bytes(frames: Iterable[Images], fps: float) -> bytes:
 
 def write_png(path: Path, picture: Images) -> None:
     """Write a PNG file, whole or not at all."""
-    with atomic_path(path) as part:
-        part.write_bytes(png_bytes(picture))
+    write_atomic(path, png_bytes(picture))
 
 
 def write_mp4(path: Path, frames: Iterable[Images], fps: float) -> None:

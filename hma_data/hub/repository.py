@@ -13,13 +13,13 @@ import re
 import shutil
 import time
 from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO
 
+from hma_data.cpu import in_order
 from hma_data.errors import HubError
 from hma_data.hub.errors import LOG_IN, explained, is_away, is_missing, is_of_xet, status, waiting
 from hma_data.storage.files import MAX_JSON_BYTES
@@ -237,11 +237,11 @@ class Repository:
 
     def _each[T](self, act: Callable[[str], T], names: Iterable[str]) -> list[T]:
         """Return the results of an action for each file, a few files at a time; the first error ends it."""
-        pool = ThreadPoolExecutor(AT_ONCE, "hub")
-        try:
-            return list(pool.map(lambda name: self._ask(lambda: act(name), f"{self.name}/{name}"), names))
-        finally:
-            pool.shutdown(cancel_futures=True)
+
+        def ask(name: str) -> T:
+            return self._ask(lambda: act(name), f"{self.name}/{name}")
+
+        return [found for _, found in in_order(ask, names, AT_ONCE)]
 
     # -- pushing
 

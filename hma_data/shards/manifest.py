@@ -7,10 +7,8 @@ import hashlib
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from itertools import batched
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -20,6 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from hma_data.cpu import in_order
 from hma_data.errors import ShardError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.schema import (
@@ -122,6 +121,11 @@ class Manifest:
         return RowLayout.of_plan(self.plan, self.embodiment)
 
     @property
+    def episodes(self) -> int:
+        """Return the number of episodes in all splits."""
+        return sum(split["episodes"] for split in self.splits.values())
+
+    @property
     def frame_stride(self) -> int:
         """Return the recorded steps a row: 1, or the embodiment's stride if only grid frames are kept."""
         return self.layout.frame_stride
@@ -148,7 +152,7 @@ class Manifest:
             "tokenizer": self.tokenizer.to_json(),
             "splits": self.splits,
             "totals": {
-                "episodes": sum(split["episodes"] for split in self.splits.values()),
+                "episodes": self.episodes,
                 "frames": sum(split["frames"] for split in self.splits.values()),
                 "bytes": sum(shard.bytes for shard in self.shards),
                 "quarantined": self.quarantined,
@@ -312,7 +316,7 @@ class Derived:
     """Everything of a set that is derived from its shards' footers; the footers themselves are not kept.
 
     Attributes:
-        plan, embodiment, tokenizer, source: of the set, as in its manifest.
+        plan, embodiment, source: of the set, as in its manifest.
         shards: as the manifest lists them, in plan order.
         stats: "action" and, if recorded, "state", over train.
         refused: the episodes in quarantine.
@@ -320,7 +324,6 @@ class Derived:
 
     plan: dict[str, Any]
     embodiment: Embodiment
-    tokenizer: TokenizerSpec
     source: str
     shards: list[ShardFile] = field(default_factory=list)
     stats: dict[str, Stats] = field(default_factory=dict)
@@ -366,7 +369,7 @@ class Derived:
         return Manifest(
             plan=self.plan,
             embodiment=self.embodiment,
-            tokenizer=self.tokenizer,
+            tokenizer=TokenizerSpec.from_json(self.plan["tokenizer"]),
             shards=tuple(self.shards),
             splits={split: self._totals(split) for split in SPLITS},
             stats={name: stats.summary() for name, stats in self.stats.items()},
@@ -399,7 +402,6 @@ def derive(
     folder: Path,
     names: Sequence[str],
     embodiment: Embodiment,
-    tokenizer: TokenizerSpec,
     plan: dict[str, Any],
     source: str,
     hashes: Mapping[str, str] | None = None,
@@ -413,22 +415,20 @@ def derive(
         hashes: sha256 of shards whose sha256 is known, by name; they are not computed again.
     """
     known = hashes or {}
-    derived = Derived(plan, embodiment, tokenizer, source)
+    derived = Derived(plan, embodiment, source)
 
     def look(name: str) -> tuple[pq.FileMetaData, int, str]:
         path = folder / name
         return read_metadata(path), path.stat().st_size, known.get(name) or file_sha256(path)
 
-    with ThreadPoolExecutor(HASHERS) as pool:
-        for some in batched(names, 4 * HASHERS):  # few footers are in memory at a time
-            for name, (metadata, size, sha256) in zip(some, pool.map(look, some)):
-                footer = Footer.from_metadata(metadata.metadata, str(folder / name))
-                if footer.plan["hash"] not in plan_hashes(plan):
-                    theirs = footer.plan["hash"]
-                    fault = f"is of the plan {theirs}, the set of {plan['hash']}: two jobs wrote here"
-                    remedy = "restart one of them with --overwrite, the other with another --out"
-                    raise ShardError(folder / name, fault, remedy)
-                rows = tuple(group_rows(metadata))
-                shard = ShardFile(name, footer.split, sum(rows), len(footer.episodes), size, sha256, rows)
-                derived.add(shard, footer)
+    for name, (metadata, size, sha256) in in_order(look, names, HASHERS):
+        footer = Footer.from_metadata(metadata.metadata, str(folder / name))
+        if footer.plan["hash"] not in plan_hashes(plan):
+            theirs = footer.plan["hash"]
+            fault = f"is of the plan {theirs}, the set of {plan['hash']}: two jobs wrote here"
+            remedy = "restart one of them with --overwrite, the other with another --out"
+            raise ShardError(folder / name, fault, remedy)
+        rows = tuple(group_rows(metadata))
+        shard = ShardFile(name, footer.split, sum(rows), len(footer.episodes), size, sha256, rows)
+        derived.add(shard, footer)
     return derived

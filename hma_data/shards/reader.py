@@ -280,8 +280,6 @@ def _words(column: pa.ChunkedArray) -> tuple[Ints, list[str]]:
     pyarrow's own functions for this import pandas if it is installed, which takes a second.
     """
     codes = column.unify_dictionaries().combine_chunks()
-    if isinstance(codes, pa.ChunkedArray):
-        codes = codes.chunk(0) if codes.num_chunks else pa.DictionaryArray.from_arrays([], [])
     return to_numpy(codes.indices).astype(np.int64), codes.dictionary.to_pylist()
 
 

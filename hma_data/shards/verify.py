@@ -8,8 +8,6 @@ N rows of a shard, A values of an action.
 """
 
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from itertools import batched
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +17,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from hma_data.cpu import usable_cores
+from hma_data.cpu import in_order, usable_cores
 from hma_data.errors import HMAError
 from hma_data.shards.manifest import (
     EMBODIMENT,
@@ -40,7 +38,6 @@ from hma_data.shards.manifest import (
     stored_embodiment,
 )
 from hma_data.shards.schema import Footer, read_footer, to_numpy
-from hma_data.shards.stats import Stats
 from hma_data.storage.files import PART, file_sha256
 from hma_data.storage.paths import StrPath
 from hma_data.storage.remote import parquet_file, parquet_input, place
@@ -73,8 +70,8 @@ def verify(
         return [_line(unreadable, folder / MANIFEST)]
     restat = restat_remedy(folder)
     found = [f"{folder / MANIFEST}: {fault} — {restat}"] if fault else []
-    derived = Derived(manifest.plan, manifest.embodiment, manifest.tokenizer, manifest.source)
-    for shard, problems, footer in _checked(folder, manifest, workers, quick, on_progress):
+    derived = Derived(manifest.plan, manifest.embodiment, manifest.source)
+    for shard, problems, footer in checked_shards(folder, manifest, workers, quick, on_progress):
         found += problems
         if footer is not None and not problems:
             derived.add(shard, footer)
@@ -92,14 +89,6 @@ def verify(
     except (HMAError, OSError, pa.ArrowException) as unreadable:
         found.append(_line(unreadable, folder))
     return found
-
-
-def shard_problems(
-    folder: Path, manifest: Manifest, workers: int | None, on_progress: OnProgress
-) -> list[str]:
-    """Return everything wrong with the shards of a set, one line for each problem."""
-    checked = _checked(folder, manifest, workers, False, on_progress)
-    return [problem for _, problems, _ in checked for problem in problems]
 
 
 # -- one shard
@@ -214,24 +203,17 @@ def _row_problems(columns: dict[str, NDArray[Any]], footer: Footer) -> list[str]
     return found
 
 
-def _row_stats(columns: dict[str, NDArray[Any]], footer: Footer, manifest: Manifest) -> dict[str, Stats]:
-    """Return statistics of the rows, each frame once, computed as a conversion computes them."""
-    merged = manifest.layout.empty_stats()
-    for row in footer.episodes:
-        own = manifest.layout.stats(columns, slice(row.row_start, row.row_start + row.length))
-        for name, stats in own.items():
-            merged[name].merge(stats)
-    return merged
-
-
 def _stats_problems(columns: dict[str, NDArray[Any]], footer: Footer, manifest: Manifest) -> list[str]:
     """Return where the footer's statistics are not those of its rows.
 
     The footer's statistics of a strided set count steps that its rows lack: a few steps at an episode's end,
     states between the rows, and the known steps of a chunk that is not wholly known.
     """
-    rows = _row_stats(columns, footer, manifest)
-    found = []
+    found, rows = [], manifest.layout.empty_stats()
+    for row in footer.episodes:  # as a conversion computes them, each frame once
+        own_rows = slice(row.row_start, row.row_start + row.length)
+        for name, stats in manifest.layout.stats(columns, own_rows).items():
+            rows[name].merge(stats)
     stride = manifest.frame_stride
     for name, own in rows.items():
         said = footer.stats.get(name)
@@ -273,20 +255,20 @@ def _plan_problem(manifest: Manifest) -> str:
     return ""
 
 
-def _checked(
+def checked_shards(
     folder: Path, manifest: Manifest, workers: int | None, quick: bool, on_progress: OnProgress
 ) -> Iterator[tuple[ShardFile, list[str], Footer | None]]:
     """Yield each shard in the manifest's order, what is wrong with it, and its footer."""
-    workers = workers or usable_cores()
     total = sum(shard.bytes for shard in manifest.shards)
     done = 0
-    with ThreadPoolExecutor(workers) as pool:
-        for shards in batched(manifest.shards, 4 * workers):  # few footers are in memory at a time
-            results = pool.map(lambda shard: check_shard(folder, shard, manifest, quick), shards)
-            for shard, (problems, footer) in zip(shards, results):
-                done += shard.bytes
-                on_progress(done, total)
-                yield shard, problems, footer
+
+    def check(shard: ShardFile) -> tuple[list[str], Footer | None]:
+        return check_shard(folder, shard, manifest, quick)
+
+    for shard, (problems, footer) in in_order(check, manifest.shards, workers or usable_cores()):
+        done += shard.bytes
+        on_progress(done, total)
+        yield shard, problems, footer
 
 
 def _foreign(folder: Path, manifest: Manifest) -> Iterator[str]:

@@ -186,7 +186,8 @@ def _pieces(shards: ShardSet, split: str, episodes: EpisodeIndex, stride: int) -
     Args:
         stride: least recorded steps of a pause that divides an episode.
     """
-    starts = _first_rows(shards, split, episodes)
+    sizes = np.array([sum(groups) for groups in shards.row_groups(split)], np.int64)
+    starts = (np.cumsum(sizes) - sizes)[episodes.shard] + episodes.start  # through all shards of the split
     entry, row, steps = episodes.pauses.T
     cut = (steps >= stride) & (row + 1 < episodes.length[entry])
     if not cut.any():
@@ -198,9 +199,3 @@ def _pieces(shards: ShardSet, split: str, episodes: EpisodeIndex, stride: int) -
     last = np.append(np.diff(owner) > 0, True)
     end = np.where(last, episodes.length[owner], np.append(begin[1:], 0))
     return owner, starts[owner] + begin, end - begin
-
-
-def _first_rows(shards: ShardSet, split: str, episodes: EpisodeIndex) -> Ints:
-    """Return the first row of each episode, counted through all shards of the split."""
-    sizes = np.array([sum(groups) for groups in shards.row_groups(split)], np.int64)
-    return (np.cumsum(sizes) - sizes)[episodes.shard] + episodes.start

@@ -178,7 +178,7 @@ def augment(
             compile=compile,
             on_progress=update,
         )
-    count = sum(split["episodes"] for split in made.splits.values())
+    count = made.episodes
     if json:
         print_json({"out": str(out), "made": episodes, "kept": count, "plan": made.plan})
         return

@@ -129,7 +129,7 @@ def write_shards(
                 stats["action"].merge(layout.stats({"action": one.chunks}, slice(None))["action"])
             writer.close(Footer(plan.facts, unit.name, unit.split, tuple(rows), left, stats))
         left = ()
-    return derive(folder, [unit.name for unit in plan.units], own, spec, plan.facts, origin).write(folder)
+    return derive(folder, [unit.name for unit in plan.units], own, plan.facts, origin).write(folder)
 
 
 def require_dataset(folder: Path) -> None:

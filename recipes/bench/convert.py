@@ -68,7 +68,7 @@ def run(settings: dict[str, Any]) -> list[dict[str, Any]]:
             "frames_per_second_limit": 1e3 * max(workers, 1) / wait if wait else None,
             "ray_cpu_seconds": round(watch.others_cpu_s, 2),
             **watch.memory(),
-            "episodes": sum(split["episodes"] for split in summary.manifest.splits.values()),
+            "episodes": summary.manifest.episodes,
             "bytes_per_frame": round(summary.manifest.to_json()["totals"]["bytes"] / rows, 1),
         }
     ]

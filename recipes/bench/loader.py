@@ -84,7 +84,7 @@ def make_set(folder: Path, number: int, settings: dict[str, Any]) -> Path:
     first = folder / names[0]
     footer, row_groups = read_footer(first)
     sha256, size = file_sha256(first), first.stat().st_size
-    derived = Derived(plan, robot, spec, "generated")
+    derived = Derived(plan, robot, "generated")
     for shard, name in enumerate(names):
         if shard:
             os.link(first, folder / name)

@@ -143,11 +143,11 @@ def _write(folder: Path, settings: dict[str, Any]) -> None:
     from hma_data.conversion.output import known_hashes
     from hma_data.shards.manifest import derive
 
-    for _, _, robot, spec in _robots(settings):
+    for _, _, robot, _ in _robots(settings):
         out = folder / robot.id
         if out.is_dir():
             note = json.loads(out.with_suffix(".json").read_text())
-            derive(out, note["names"], robot, spec, note["facts"], SOURCE, known_hashes(out)).write(out)
+            derive(out, note["names"], robot, note["facts"], SOURCE, known_hashes(out)).write(out)
 
 
 def _read(folder: Path, settings: dict[str, Any]) -> None:
@@ -162,14 +162,14 @@ def _read(folder: Path, settings: dict[str, Any]) -> None:
 
 def _resume(folder: Path, settings: dict[str, Any]) -> None:
     """Plan each recording again, look which shards are there and whole, and check the derived files."""
-    from hma_data.conversion.output import finished_shards
+    from hma_data.conversion.output import ShardHolder
     from hma_data.shards.manifest import Manifest, damaged_files
 
     for robot, _, plan in _planned(settings):
         out = folder / robot.id
         if out.is_dir():
             manifest = Manifest.load(out)
-            done = finished_shards(out, plan, None, False)
+            done = ShardHolder(out, robot, SOURCE).finished(plan, None, False)
             if len(done) < len(plan.units) or damaged_files(out, manifest):
                 raise RuntimeError(f"{out} is not whole")
 

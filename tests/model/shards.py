@@ -74,5 +74,5 @@ def make_shards(
             stats = Stats.of(np.concatenate([whole[number][1] for number in numbers]))
             writer.close(Footer(plan, path, split, tuple(rows), (), {"action": stats}))
     names = [f"{split}/shard-00000.parquet" for split in parts]
-    derive(folder, names, embodiment, spec, plan, "made").write(folder)
+    derive(folder, names, embodiment, plan, "made").write(folder)
     return folder

@@ -216,7 +216,7 @@ def write(path: Path, table: pa.Table, metadata: dict[bytes, bytes]) -> None:
 def derive_anew(folder: Path) -> None:
     old = Manifest.load(folder)
     names = [shard.path for shard in old.shards]
-    derive(folder, names, old.embodiment, old.tokenizer, old.plan, old.source).write(folder)
+    derive(folder, names, old.embodiment, old.plan, old.source).write(folder)
 
 
 def rewritten(folder: Path, change) -> list[str]:
