@@ -49,7 +49,11 @@ class Found:
     def counted(self) -> "Found":
         """Return this with the number of its episodes, or with the reason why they cannot be counted."""
         try:
-            return replace(self, episodes=self._count())
+            if self.format != SHARDS:
+                return replace(self, episodes=len(open_source(self.format).episode_ids(self.path)))
+            from hma_data.shards.manifest import Manifest
+
+            return replace(self, episodes=Manifest.load(self.path).episodes)
         except HMAError as fault:
             return replace(self, problem=str(fault))
 
@@ -58,13 +62,6 @@ class Found:
         values = {key: value for key, value in asdict(self).items() if key != "beside"}
         return values | {"path": str(self.path), "command": self.command}
 
-    def _count(self) -> int:
-        if self.format == SHARDS:
-            from hma_data.shards.manifest import Manifest
-
-            return sum(split["episodes"] for split in Manifest.load(self.path).splits.values())
-        return len(open_source(self.format).episode_ids(self.path))
-
 
 def several(folder: StrPath) -> list[Found]:
     """Return the recordings of a folder that cannot be read as one recording; empty if it can, or has none.
@@ -72,7 +69,7 @@ def several(folder: StrPath) -> list[Found]:
     Args:
         folder: str or path of a folder on this machine.
     """
-    folder = as_path(folder)
+    folder = as_path(folder).expanduser()
     found = list(_found(folder, recognitions(), False))
     apart = [one for one in found if not one.beside]
     alone = len(apart) == 1 and (apart[0].path == folder or apart[0].format not in ("lerobot", SHARDS))

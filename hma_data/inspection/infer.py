@@ -28,7 +28,6 @@ from hma_data.inspection.infer_choices import (
     camera_names,
     cameras,
     dims,
-    first_choice,
     instruction,
     is_gripper,
     likely,
@@ -221,16 +220,18 @@ class _Draft:
         rh20t = found.format == "rh20t"  # the names of its tables, not of their values, tell what they hold
         tables = [key for key in found.keys if key.kind == "vector"]
         guesses = ACTION_GUESSES.get(found.format, STEP_GUESSES)
-        self.action = first_choice(guesses, tables if rh20t else numbers)
+        choices = (guess(tables if rh20t else numbers) for guess in guesses)
+        self.action = next((choice for choice in choices if choice.keys), Choice())
         chosen_states = infer_topics.states if self.bag else states
         self.states = chosen_states(numbers, () if rh20t else self.action.keys)
         if not self.action.keys:
             raise _lacks(found, "has nothing that could be an action", self.seen.keys)
         self.by_receipt = infer_topics.why_by_receipt([*self.seen.keys, *self.action.keys, *self.states])
         if self.by_receipt:  # what is proposed is measured by the clock that is proposed
-            self.seen = replace(self.seen, keys=_all_by_receipt(self.seen.keys))
-            self.action = replace(self.action, keys=_all_by_receipt(self.action.keys))
-            self.states = _all_by_receipt(self.states)
+            received = infer_topics.timed_by_receipt
+            self.seen = replace(self.seen, keys=tuple(map(received, self.seen.keys)))
+            self.action = replace(self.action, keys=tuple(map(received, self.action.keys)))
+            self.states = tuple(map(received, self.states))
         hz = self.seen.keys[0].hz if self.bag else found.hz
         self.hz = hz if hz is not None and 0 < hz <= MAX_HZ else None
         self.used = [*self.seen.keys, *self.action.keys, *self.states]
@@ -386,14 +387,10 @@ class _Draft:
                 said["max_skew_ms"] = f"{factor}; intervals, measured: {gaps}"
             if self.by_receipt:
                 said["stamp"] = f"{TODO}: {self.by_receipt}; may streams be aligned by receive times?"
-            if pause := self._pause():
-                said["segments"] = str(pause)
+            primary = self.seen.keys[0].key
+            if pauses := [one for one in self.found.findings if (one.check, one.key) == ("gaps", primary)]:
+                said["segments"] = str(pauses[0])
         return said
-
-    def _pause(self) -> Finding | None:
-        """Return the finding on pauses of the primary camera, if it has any."""
-        key, found = self.seen.keys[0].key, self.found.findings
-        return next((one for one in found if one.check == "gaps" and one.key == key), None)
 
     def _rate_from(self) -> str:
         if not self.bag:
@@ -412,10 +409,6 @@ def _by_a_running_clock(key: KeyInfo) -> KeyInfo:
     topic = key.topic
     set_back = topic is not None and topic.goes_back and not topic.receipt_goes_back
     return infer_topics.timed_by_receipt(key) if set_back else key
-
-
-def _all_by_receipt(keys: Iterable[KeyInfo]) -> tuple[KeyInfo, ...]:
-    return tuple(infer_topics.timed_by_receipt(key) for key in keys)
 
 
 def _showing(seen: Choice, findings: Iterable[Finding]) -> tuple[Choice, list[str]]:

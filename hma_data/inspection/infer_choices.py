@@ -394,15 +394,6 @@ STEP_GUESSES: tuple[Guess, ...] = (whole_action, action_group, named_otherwise, 
 RH20T_GUESSES: tuple[Guess, ...] = (next_poses, likely)
 
 
-def first_choice(guesses: Iterable[Guess], found: list[KeyInfo]) -> Choice:
-    """Return the choice of the first guess that finds keys; an empty one where none does."""
-    for guess in guesses:
-        choice = guess(found)
-        if choice.keys:
-            return choice
-    return Choice()
-
-
 def instruction(keys: Iterable[KeyInfo]) -> str | None:
     """Return the key of the language instruction; None where there is none."""
     ranked = []

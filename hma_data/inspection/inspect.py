@@ -6,7 +6,6 @@ sample of episodes read and aligned as this robot's; for a shard set those of it
 """
 
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -59,16 +58,27 @@ def _inspected(uri: str, robot: Embodiment | None, episodes: int) -> tuple[Sourc
         raise of_another_format(uri, format_name, fault) from fault
 
 
-@contextmanager
-def _reading(name: str) -> Iterator[None]:
-    """Raise an error of any kind as an EpisodeError: a conversion refuses such an episode and goes on."""
-    try:
-        yield
-    except (HMAError, MemoryError):
-        raise
-    except Exception as fault:
-        text = f"stops its reader with {type(fault).__name__}: {fault}"
-        raise EpisodeError(name, text, "report this as a bug of the reader") from fault
+def _clips(
+    uri: str, robot: Embodiment, source: Source, names: Iterable[str]
+) -> Iterator[tuple[str, Clip | HMAError]]:
+    """Yield each episode as the robot's clip, whose first and last frames can be decoded, or its fault.
+
+    An error of any kind is a fault, because a conversion refuses such an episode and goes on.
+    """
+    for name in names:
+        found: Clip | HMAError
+        try:
+            found = to_clip(source.read(uri, name, robot), robot)
+            for camera in robot.cameras:
+                found.frames_at(camera.name, np.unique([0, len(found) - 1]))
+        except MemoryError:
+            raise
+        except HMAError as fault:
+            found = fault
+        except Exception as fault:
+            text = f"stops its reader with {type(fault).__name__}: {fault}"
+            found = EpisodeError(name, text, "report this as a bug of the reader")
+        yield name, found
 
 
 # -- hma inspect
@@ -124,15 +134,10 @@ def _fit(
         names = ids_for_robot([ref.id for ref in source.index(uri, robot)], robot)
     except HMAError as fault:
         faults.append(fault)
-    for name in names[:MAX_TRIED]:
-        try:
-            with _reading(name):
-                clip = to_clip(source.read(uri, name, robot), robot)
-                frames = clip.frames_at(robot.primary_camera.name, np.arange(min(len(clip), 2)))
-                sizes = {name: clip.frames_at(name, np.arange(1)).shape[1:3] for name in clip.frame_indices}
+    for _, clip in _clips(uri, robot, source, names[:MAX_TRIED]):
+        if isinstance(clip, Clip):
             break
-        except HMAError as fault:
-            faults.append(fault)
+        faults.append(clip)
     else:
         first = faults[0] if faults else SourceError(uri, "has no episodes")
         said = f"{robot.id} does not fit: {first}{_alike(robot, inspection)}"
@@ -141,10 +146,13 @@ def _fit(
     if faults:
         said = f"{len(faults)} of the first {len(faults) + 1} episodes cannot be used: {faults[0]}"
         found.append(Finding("usable", "warn", said, numbers={"refused": len(faults)}))
-    facts["first episode"] = f"{name}: {len(clip)} frames on the grid, {clip.trimmed} trimmed at its ends"
-    facts["images"] = "×".join(map(str, frames.shape[1:]))
+    facts["first episode"] = (
+        f"{clip.episode.id}: {len(clip)} frames on the grid, {clip.trimmed} trimmed at its ends"
+    )
+    shapes = {camera.name: clip.frames_at(camera.name, np.arange(1)).shape[1:] for camera in robot.cameras}
+    facts["images"] = "×".join(map(str, shapes[robot.primary_camera.name]))
     for camera in robot.cameras:
-        height, width = sizes[camera.name]
+        height, width = shapes[camera.name][:2]
         said = describe_resize(camera, height, width, TOKENIZER_SIDE)
         facts[f"camera {camera.name}"] = said.removeprefix(f"{camera.name}: ")
     hz = measured_hz(np.diff(clip.timestamps))
@@ -361,15 +369,11 @@ def _episodes(
     chosen = [names[i] for i in sampled(len(names), sample)]
     refused: list[tuple[str, HMAError]] = []
     clips: list[Clip] = []
-    for name in chosen:
-        try:
-            with _reading(name):
-                clip = to_clip(source.read(uri, name, robot), robot)
-                for camera in robot.cameras:  # can they be decoded? the inspection judged the frames
-                    clip.frames_at(camera.name, np.array([len(clip) - 1]))
-            clips.append(clip)
-        except HMAError as fault:
-            refused.append((name, fault))
+    for name, found in _clips(uri, robot, source, chosen):
+        if isinstance(found, Clip):
+            clips.append(found)
+        else:
+            refused.append((name, found))
     severity: Severity = "warn" if clips else "error"
     for which, first in alike(refused):
         said = f"{len(which)} of {len(chosen)} sampled episodes, such as {which[0]}: {first.fault}"
@@ -466,10 +470,9 @@ def _shard_set(folder: Path) -> Iterator[Finding]:
         return
     shards = ShardSet(folder)
     manifest = shards.manifest
-    kept = sum(split["episodes"] for split in manifest.splits.values())
     if manifest.quarantined:
-        said = f"{manifest.quarantined:,} episodes refused, {kept:,} kept; reasons in quarantine.jsonl"
-        yield Finding("quarantine", "warn", said)
+        said = f"{manifest.quarantined:,} episodes refused, {manifest.episodes:,} kept"
+        yield Finding("quarantine", "warn", f"{said}; reasons in quarantine.jsonl")
     if not manifest.splits["train"]["episodes"]:
         yield Finding("split", "error", "no episode is in the train split")
     elif short := window_finding(shards):

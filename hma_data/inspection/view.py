@@ -25,6 +25,7 @@ from hma_data.sources.base import open_source
 from hma_data.sources.common.choice import ids_for_robot
 from hma_data.storage.files import atomic_path
 from hma_data.storage.paths import StrPath, as_path, as_text
+from hma_data.tables import Table
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
 
 JPEG_QUALITY = 92  # percent
@@ -155,10 +156,11 @@ def view_recording(
     coder = get_tokenizer(as_text(tokenizer)) if tokenizer else None
     view = View(f"{robot.id} {clip.episode.id}", clip.timestamps)
     for camera in robot.cameras:
-        view.pictures(f"cameras/{camera.name}", _recorded(clip, camera.name))
+        rows = _parts(np.arange(len(clip)))
+        view.pictures(f"cameras/{camera.name}", (clip.frames_at(camera.name, some) for some in rows))
         if coder:
             view.pictures(f"decoded/{camera.name}", _coded(clip, robot, camera.name, coder))
-    _vectors(view, robot, clip.actions, clip.action_known, clip.states, clip.state_known)
+    _vectors(view, robot, clip.actions, clip.states, clip.action_known, clip.state_known)
     for stream, skew in clip.skew_ms.items():
         view.curves(f"skew_ms/{stream}", skew[:, None], [stream])
     facts = {"robot": robot.id, "episode": clip.episode.id, "recording": uri, "frames": len(clip)}
@@ -193,34 +195,21 @@ def view_shards(folder: StrPath, episode: int = 0, tokenizer: Tokenizer | None =
         tokens = shards.tokens(columns[camera][token_column(shards.spec)[0]])
         view.pictures(f"decoded/{camera}", (coder.decode(part) for part in _parts(tokens)))
     actions = first["action"][:, : robot.action_dim]  # the first command of a strided chunk
-    _vectors(view, robot, actions, first.get("action_known"), first.get("state"), first.get("state_known"))
+    _vectors(view, robot, actions, *(first.get(name) for name in ("state", "action_known", "state_known")))
     facts = {"robot": robot.id, "tokenizer": shards.spec.name, "shards": str(shards.folder)}
     told = ("id", "split", "length", "instruction", "success", "skew_p50_ms", "skew_max_ms", "flags")
     view.text(_table(facts | {name: row[name] for name in told}))
     return view
 
 
-def _vectors(
-    view: View,
-    robot: Embodiment,
-    actions: NDArray[Any],
-    action_known: NDArray[Any] | None,
-    states: NDArray[Any] | None,
-    state_known: NDArray[Any] | None,
-) -> None:
-    view.curves("actions", _masked(actions, action_known), robot.action.names())
-    if states is not None and robot.state:
-        view.curves("states", _masked(states, state_known), robot.state.names())
-
-
-def _masked(values: NDArray[Any], known: NDArray[Any] | None) -> NDArray[np.float64]:
-    return np.where(True if known is None else np.asarray(known, np.bool_)[:, None], values, np.nan)
-
-
-def _recorded(clip: Clip, camera: str) -> Iterator[Images]:
-    """Yield the images of the frames, as large as they were recorded."""
-    for rows in _parts(np.arange(len(clip))):
-        yield clip.frames_at(camera, rows)
+def _vectors(view: View, robot: Embodiment, actions: NDArray[Any], *others: NDArray[Any] | None) -> None:
+    """Add the curves of the actions, and of the others: states, then which actions and states are known."""
+    states, *known = others
+    drawn = (("actions", actions, robot.action), ("states", states, robot.state))
+    for (name, values, vector), mask in zip(drawn, known, strict=True):
+        if values is not None and vector:
+            shown = values if mask is None else np.where(mask[:, None], values, np.nan)
+            view.curves(name, shown, vector.names())
 
 
 def _coded(clip: Clip, robot: Embodiment, camera: str, tokenizer: Tokenizer) -> Iterator[Images]:
@@ -242,5 +231,4 @@ def _number(ids: Sequence[str], episode: int, where: str) -> str:
 
 
 def _table(facts: dict[str, Any]) -> str:
-    rows = [f"| {name} | {value} |" for name, value in facts.items() if value not in ("", None)]
-    return "\n".join(["| | |", "|---|---|", *rows])
+    return Table(["", ""], [pair for pair in facts.items() if pair[1] not in ("", None)]).markdown()

@@ -220,6 +220,11 @@ def test_each_recording_has_its_format_count_and_command(mixed: Path) -> None:
     assert "'" + str(mixed) in shown.stdout
 
 
+def test_a_folder_may_be_named_with_a_tilde(mixed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(mixed.parent))
+    assert {one.format for one in several(f"~/{mixed.name}")} == {"hdf5", "rosbag"}
+
+
 def test_a_folder_that_is_one_recording_is_inspected_as_one(mixed: Path) -> None:
     (mixed / "broken.mcap").unlink()
     assert several(mixed) == []
