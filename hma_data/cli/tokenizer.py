@@ -7,12 +7,15 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from hma_data.cli.options import Json, robot_option, tokenizers
+from hma_data.cli.options import Json, Weights, robot_option, tokenizers
 from hma_data.console import human_bytes, interruptible, print_json, print_table, say
 from hma_data.errors import MissingDependencyError, RecipeError, UsageError
 
 tokenizer_app = typer.Typer(no_args_is_help=True, help="List, train and measure tokenizers.")
 Device = Annotated[str, Option(help="Device of the network: cpu, cuda, mps.")]
+Data = Annotated[list[str], Argument(help="Images, videos, folders of them, recordings, shard sets.")]
+Robot = Annotated[str | None, robot_option("Robot of the recordings: id or YAML file.")]
+Frames = Annotated[int, Option(min=1, help="Frames of each video or episode, evenly spaced.")]
 
 
 @tokenizer_app.command("list")
@@ -88,10 +91,10 @@ def tokenizer_train(
 @tokenizer_app.command("eval")
 def tokenizer_eval(
     tokenizer: Annotated[str, Argument(help="Name of the tokenizer.", autocompletion=tokenizers)],
-    data: Annotated[list[str], Argument(help="Images, videos, folders of them, recordings, shard sets.")],
-    embodiment: Annotated[str | None, robot_option("Robot of the recordings: id or YAML file.")] = None,
-    weights: Annotated[str | None, Option(help="Tokenizer weights other than the default.")] = None,
-    frames: Annotated[int, Option(min=1, help="Frames of each video or episode, evenly spaced.")] = 64,
+    data: Data,
+    embodiment: Robot = None,
+    weights: Weights = None,
+    frames: Frames = 64,
     lpips: Annotated[
         bool | None, Option(help="Measure LPIPS; default: only if it needs no download.")
     ] = None,
@@ -135,10 +138,10 @@ def tokenizer_eval(
 
 @tokenizer_app.command("fit")
 def tokenizer_fit(
-    data: Annotated[list[str], Argument(help="Images, videos, folders of them, recordings, shard sets.")],
-    embodiment: Annotated[str | None, robot_option("Robot of the recordings: id or YAML file.")] = None,
+    data: Data,
+    embodiment: Robot = None,
     colors: Annotated[int, Option(min=2, max=255, help="Number of colours; fewer are learned faster.")] = 32,
-    frames: Annotated[int, Option(min=1, help="Frames of each video or episode, evenly spaced.")] = 16,
+    frames: Frames = 16,
     out: Annotated[Path, Option(help="Output weights.")] = Path("colors.safetensors"),
 ) -> None:
     """Choose colours for palette-64 that fit the images of a simulator; takes seconds.

@@ -15,22 +15,21 @@ import json
 import math
 import platform
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from itertools import islice
+from functools import partial
+from io import BytesIO
 from operator import gt
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hma_data.errors import RecipeError, TokenizerError
-from hma_data.storage.files import remove_dead_parts, write_atomic
+from hma_data.cpu import in_order
+from hma_data.errors import HMAError, RecipeError, TokenizerError
+from hma_data.storage.files import opened_weights, remove_dead_parts, write_atomic
+from hma_data.storage.kinds import one_line
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import OTHER
 from hma_data.tokenizers.checkpoints import fill, read_weights, save_weights
@@ -200,18 +199,17 @@ class TokenizerTraining:
 
     def save(self, path: Path) -> None:
         """Write what `resume` needs, atomically."""
-        metadata = {
-            "course": self.recipe.course(),
-            "step": str(self.step),
-            "rates": self._past_rates(self.step),
-            "seconds": str(round(self.seconds, 3)),
+        content = {
+            "past": [self.recipe.course(), self._past_rates(self.step)],
+            "step": self.step,
+            "seconds": self.seconds,
+            "network": self.network.state_dict(),
+            "average": self.average,
+            "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
         }
-        state = {f"network.{name}": parameter.detach() for name, parameter in self.network.named_parameters()}
-        state |= {f"average.{name}": tensor for name, tensor in self.average.items()}
-        for number, optimizer in enumerate(self.optimizers):
-            for index, moments in optimizer.state_dict()["state"].items():
-                state |= {f"moment.{number}.{index}.{key}": moment for key, moment in moments.items()}
-        write_atomic(path, save({name: tensor.contiguous() for name, tensor in state.items()}, metadata))
+        state = BytesIO()
+        torch.save(content, state)
+        write_atomic(path, state.getvalue())
 
     def resume(self, path: Path) -> None:
         """Resume from a state that `save` wrote.
@@ -221,30 +219,17 @@ class TokenizerTraining:
         """
         remedy = f"delete {path.name} to start again"
         try:
-            with safe_open(path, "pt") as file:
-                metadata = file.metadata() or {}
-                state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        except (SafetensorError, OSError) as fault:
-            raise RecipeError(
-                path, f"is not the saved state of a training: {fault!s:.120}", remedy
-            ) from fault
-        step = int(metadata.get("step", 0))
-        past = (metadata.get("course"), metadata.get("rates"))
-        if past != (self.recipe.course(), self._past_rates(step)):
+            state = torch.load(path, map_location=self.device, weights_only=True)
+            past, step = state["past"], state["step"]
+        except Exception as fault:  # torch raises many kinds of errors on a damaged file
+            text = f"is not the saved state of a training: {one_line(fault, 120)}"
+            raise RecipeError(path, text, remedy) from fault
+        if past != [self.recipe.course(), self._past_rates(step)]:
             raise RecipeError(path, "is the state of a training with other settings", remedy)
-        self.step, self.seconds = step, float(metadata.get("seconds", 0))
-        with torch.no_grad():
-            for name, parameter in self.network.named_parameters():
-                parameter.copy_(state[f"network.{name}"])
-                self.average[name].copy_(state[f"average.{name}"])
-        for number, optimizer in enumerate(self.optimizers):
-            moments: dict[int, dict[str, Tensor]] = {}
-            for name in state:
-                if name.startswith(f"moment.{number}."):
-                    index, key = name.split(".")[2:]
-                    moments.setdefault(int(index), {})[key] = state[name]
-            groups = optimizer.state_dict()["param_groups"]
-            optimizer.load_state_dict({"state": moments, "param_groups": groups})
+        self.step, self.seconds, self.average = step, state["seconds"], state["average"]
+        self.network.load_state_dict(state["network"])
+        for optimizer, own in zip(self.optimizers, state["optimizers"], strict=True):
+            optimizer.load_state_dict(own)
 
     def _past_rates(self, step: int) -> str:
         """Return a digest of the rates of all steps before this one."""
@@ -355,9 +340,9 @@ def train(
 def _finished(out: Path, facts: dict[str, Any], steps: int) -> dict[str, Any] | None:
     """Return what the weights' file says of its training, if that is this one to its last step."""
     try:
-        with safe_open(out, "pt") as file:
+        with opened_weights(out) as file:
             told: dict[str, Any] = json.loads((file.metadata() or {}).get("training", "{}"))
-    except (SafetensorError, OSError, ValueError):
+    except (HMAError, ValueError):
         return None
     asked = {key: facts[key] for key in ("recipe_sha256", "corpus_sha256", "seed")} | {"steps": steps}
     return told if asked.items() <= told.items() else None
@@ -365,12 +350,6 @@ def _finished(out: Path, facts: dict[str, Any], steps: int) -> dict[str, Any] | 
 
 def _crops(run: TokenizerTraining, workers: int) -> Iterator[Tensor]:
     """Yield the crops of every remaining step, in order; threads draw them ahead."""
-    count, steps = run.recipe.training.batch, iter(range(run.step, run.recipe.training.steps))
-    if not workers:
-        yield from (run.batch(step, count) for step in steps)
-        return
-    with ThreadPoolExecutor(workers) as pool:
-        ahead = deque(pool.submit(run.batch, step, count) for step in islice(steps, 2 * workers))
-        while ahead:
-            yield ahead.popleft().result()
-            ahead.extend(pool.submit(run.batch, step, count) for step in islice(steps, 1))
+    draw = partial(run.batch, count=run.recipe.training.batch)
+    steps = range(run.step, run.recipe.training.steps)
+    return (crops for _, crops in in_order(draw, steps, workers)) if workers else map(draw, steps)
