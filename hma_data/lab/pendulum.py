@@ -97,20 +97,15 @@ def start(seed: int, episode: int) -> tuple[Pendulum, np.random.Generator]:
 
 
 def begin(robot: str, seed: int, episode: int) -> tuple[Pendulum, Callable[[], NDArray[np.float32]]]:
-    """Return the simulation of an episode at its start, and the recorder's driver."""
+    """Return the simulation of an episode at its start, and the recorder's driver of torques (1,)."""
     world, rng = start(seed, episode)
-    return world, driver(world, rng, episode)
-
-
-def driver(world: Pendulum, rng: np.random.Generator, episode: int) -> Callable[[], NDArray[np.float32]]:
-    """Return the recorder's driver of an episode, which returns the next torque (1,)."""
     _, manoeuvre = DRIVERS[episode % len(DRIVERS)]
     drive = manoeuvre(rng)
 
     def act() -> NDArray[np.float32]:
         return np.array([np.clip(drive(world.angle, world.speed), -TORQUE, TORQUE)], dtype=np.float32)
 
-    return act
+    return world, act
 
 
 def _episode(seed: int, episode: int) -> RldsEpisode:

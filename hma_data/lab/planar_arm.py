@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.lab import imported
-from hma_data.lab.family.look import SCALE, SIZE, Color, Floats, Shape, draw, shrunk
+from hma_data.lab.family.look import SCALE, SIZE, Color, Floats, Shape, box, draw, shrunk
 from hma_data.lab.writers import Demo, block_demo, write_hdf5
 from hma_data.registry.embodiment import find
 from hma_data.sources.lerobot.writer import LeRobotEpisode, write_lerobot
@@ -166,11 +166,8 @@ class PlanarArm:
     def picture(self) -> NDArray[np.uint8]:
         """Draw the arm and the blocks; (SIZE, SIZE, 3) RGB."""
         shapes = []
-        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * BLOCK / 2
-        for (x, y, angle), color in zip(self.blocks, BLOCK_COLORS, strict=True):
-            cos, sin = np.cos(angle), np.sin(angle)
-            outline = corners @ np.array([[cos, sin], [-sin, cos]]) + (x, y)
-            shapes.append(Shape(PX * outline, 0, color))
+        for pose, color in zip(self.blocks, BLOCK_COLORS, strict=True):
+            shapes.append(Shape(PX * box(pose[:2], pose[2], BLOCK / 2, BLOCK / 2), 0, color))
         elbow, tip = elbow_and_tip(self.angles)
         shapes += [*_link(BASE, elbow, UPPER_COLOR), *_link(elbow, tip, FORE_COLOR)]
         shapes += [_disc(BASE, RADIUS * 0.7, DARK), _disc(elbow, RADIUS * 0.45, DARK)]

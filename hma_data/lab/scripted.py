@@ -109,7 +109,7 @@ class SeenPush:
     """The state of pusht_fast: the pusher follows its target with the lag of its spring."""
 
     def __init__(self, places: Floats) -> None:
-        self._agent, self._tee = places[0] / pusht.PX, places[1:]
+        self.see(places)
 
     @property
     def state(self) -> SceneState:

@@ -198,13 +198,13 @@ def _features(
     episode: dict[str, Any] = {"steps": sequence}
     if facts:
         episode["episode_metadata"] = {
-            key: words if isinstance(value, str) else _scalar("bool" if isinstance(value, bool) else "int64")
-            for key, value in facts.items()
+            key: words if isinstance(value, str) else _scalar(value) for key, value in facts.items()
         }
     return _dict(episode)
 
 
-def _scalar(dtype: str) -> dict[str, Any]:
+def _scalar(value: bool | int) -> dict[str, Any]:
+    dtype = "bool" if isinstance(value, bool) else "int64"
     tensor = {"shape": {}, "dtype": dtype, "encoding": "none"}
     return {"pythonClassName": f"{_CORE}.scalar.Scalar", "tensor": tensor}
 
@@ -225,12 +225,8 @@ def _example(episode: RldsEpisode) -> bytes:
         lists[f"steps/{key}"] = _field(2, _field(1, np.ascontiguousarray(values, "<f4").tobytes()))
     lists["steps/language_instruction"] = _field(1, _field(1, episode.instruction.encode()) * length)
     for key, fact in episode.facts.items():
-        value = (
-            _field(1, _field(1, fact.encode()))
-            if isinstance(fact, str)
-            else _field(3, _field(1, _varint(fact)))
-        )
-        lists[f"episode_metadata/{key}"] = value
+        kind, value = (1, fact.encode()) if isinstance(fact, str) else (3, _varint(fact))
+        lists[f"episode_metadata/{key}"] = _field(kind, _field(1, value))
     entries = (_field(1, name.encode()) + _field(2, content) for name, content in lists.items())
     return _field(1, b"".join(_field(1, entry) for entry in entries))
 

@@ -35,7 +35,7 @@ class Driver:
         self._left = 0
         self._goal: Floats | None = None
         self._opening = float(pose[-1])
-        self._manoeuvre: Manoeuvre = lambda pose: np.zeros(len(body.commands))
+        self._manoeuvre = self._rest()
 
     def __call__(self, pose: Floats, blocks: Floats, holding: bool) -> Floats:
         """Return the next action (A,) at a pose (Q,) among blocks (B, 2)."""
