@@ -130,3 +130,8 @@ def write_tiny_whole(path: Path, **sizes: int) -> Path:
         whole[f"decoder.layers.{int(place) - 1}.{rest}"] = tensor
     save_file(whole, path)
     return path
+
+
+def scenes(count: int, size: int) -> np.ndarray:
+    rng = np.random.default_rng(5)
+    return np.stack([draw_scene(rng, size) for _ in range(count)])

@@ -203,3 +203,8 @@ def make_v3(folder: Path, lengths: Sequence[int] = (12, 9, 15), codec: str = "h2
     shown = [10 * e + i for e, n in enumerate(lengths) for i in range(n)]
     encode(folder / f"videos/{CAMERA}/chunk-000/file-000.mp4", shown, codec, fps)
     return folder
+
+
+def in_order(path: Path) -> np.ndarray:
+    with av.open(str(path)) as container:
+        return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])

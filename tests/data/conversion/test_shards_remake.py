@@ -71,6 +71,9 @@ def test_split_gives_the_same_bytes_for_any_number_of_workers(made, tmp_path, wo
     split(made, tmp_path / "b", seed=5, workers=workers)
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
     assert episodes(tmp_path / "a") == episodes(made)
+    (tmp_path / "a" / "embodiment.yaml").unlink()  # the same call writes it again
+    split(made, tmp_path / "a", seed=5)
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
 
 
 def test_split_by_instruction_keeps_equal_instructions_together(made: Path, tmp_path: Path) -> None:

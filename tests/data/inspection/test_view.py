@@ -12,7 +12,7 @@ import pytest
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.errors import MissingDependencyError
-from hma_data.inspection.view import view_recording, view_shards
+from hma_data.inspection.view import _table, view_recording, view_shards
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from tests.command import fails, hma
@@ -97,6 +97,7 @@ def test_unknown_actions_are_a_gap(toy_yaml: Path, tmp_path: Path, monkeypatch: 
 
 
 def test_what_cannot_be_shown_says_what_to_do(toy_yaml, tmp_path, monkeypatch) -> None:
+    assert _table({"instruction": "a | b"}).splitlines()[-1] == r"| instruction | a \| b |"
     recording = tmp_path / "toy.hdf5"
     fails(hma("view", recording), 2, "add -e ROBOT")
     fails(hma("view", recording, "-e", toy_yaml, "--episode", 3), 2, "3 episodes")

@@ -226,8 +226,7 @@ def test_random_tokens_of_18_bits_cost_less_than_600_bytes_a_frame(tmp_path: Pat
         for start in range(0, frames, 128):
             tokens = rng.integers(0, 2**18, (128, 16, 16), dtype=np.uint32)
             own = actions[start : start + 128]
-            columns = {"timestamp": np.arange(128) / 5, "tokens": tokens, "action": own}
-            writer.add(start // 128, columns)
+            writer.add(start // 128, {"timestamp": np.arange(128) / 5, "tokens": tokens, "action": own})
         stats = {"action": Stats.of(actions)}
         writer.close(Footer(plan, "train/shard-00000.parquet", "train", (), (), stats))
     metadata = pq.read_metadata(path)
@@ -251,8 +250,7 @@ def test_row_groups_of_large_frames_hold_fewer_of_them(tmp_path: Path) -> None:
         for episode, length in enumerate((30, 50, 10, 100)):
             actions = np.zeros((length, 1), np.float32)
             time = np.arange(length) / 10
-            columns = {"timestamp": time, "latents": pictures[:length], "action": actions}
-            writer.add(episode, columns)
+            writer.add(episode, {"timestamp": time, "latents": pictures[:length], "action": actions})
         stats = {"action": Stats.of(np.zeros((190, 1), np.float32))}
         writer.close(Footer(plan, "train/shard-00000.parquet", "train", (), (), stats))
     file = pq.ParquetFile(path)

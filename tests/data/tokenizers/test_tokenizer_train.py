@@ -22,15 +22,10 @@ from hma_data.tokenizers.training.muon import Muon, orthogonal
 from hma_data.tokenizers.training.recipe import DrawnSource, load_recipe
 from hma_data.tokenizers.training.train import start_from, train
 from tests.data import tokenizer_files
-from tests.data.tokenizer_files import Stopped, draw_scene, drawn_corpus, stop_at
+from tests.data.tokenizer_files import Stopped, drawn_corpus, scenes, stop_at
 
 RECIPE = shipped("recipes") / "tokenizer" / "fsq.yaml"
 SMALL = FsqConfig(width=(8, 8), hidden=8, encoder_blocks=(1, 1), decoder_blocks=(1, 1, 1), fine_width=4)
-
-
-def scenes(count: int, size: int) -> np.ndarray:
-    rng = np.random.default_rng(5)
-    return np.stack([draw_scene(rng, size) for _ in range(count)])
 
 
 def write_recipe(folder: Path, **training: object) -> Path:

@@ -21,7 +21,7 @@ from hma_data.tokenizers.training.eval import CodebookUse, evaluate, psnr_db, ss
 from hma_data.tokenizers.training.frames import read_films
 from hma_data.tokenizers.training.recipe import load_recipe
 from tests.data.fresh import run_fresh
-from tests.data.tokenizer_files import draw_scene, write_tiny_whole
+from tests.data.tokenizer_files import scenes, write_tiny_whole
 
 FORMAT, WEIGHTS = FsqConfig.format, EMBEDDED / "fsq.safetensors"
 SMALL = FsqConfig(width=(8, 8), hidden=8, encoder_blocks=(1, 1), decoder_blocks=(1, 1, 1), fine_width=4)
@@ -35,11 +35,6 @@ def fsq8() -> Tokenizer:
 @pytest.fixture(scope="module")
 def fsq16() -> Tokenizer:
     return get_tokenizer("fsq-16")
-
-
-def scenes(count: int, size: int) -> np.ndarray:
-    rng = np.random.default_rng(5)
-    return np.stack([draw_scene(rng, size) for _ in range(count)])
 
 
 HERE = [name for name, entry in CATALOG.items() if entry.weights in ("embedded", "none")]

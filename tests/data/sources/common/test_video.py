@@ -19,7 +19,7 @@ from hma_data.errors import EpisodeError
 from hma_data.registry.components import Camera
 from hma_data.sources.common.video_file import VideoFile, frame_table
 from tests.data.fresh import run_fresh
-from tests.data.videos import HEIGHT, WIDTH, encode, number_of, picture, turn
+from tests.data.videos import HEIGHT, WIDTH, encode, in_order, number_of, picture, turn
 from tests.hostile import Row, damage, untouched, whole
 
 LENGTH = 40
@@ -28,11 +28,6 @@ LENGTH = 40
 @pytest.fixture(scope="module", params=["h264", "av1"])
 def video(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return encode(tmp_path_factory.mktemp("video") / "v.mp4", range(LENGTH), request.param)
-
-
-def in_order(path: Path) -> np.ndarray:
-    with av.open(str(path)) as container:
-        return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
 
 
 def test_every_frame_equals_decoding_in_order(video: Path) -> None:

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
 
 import av
 import cv2
@@ -14,7 +13,7 @@ from hma_data.errors import EpisodeError
 from hma_data.sources.bags.images import VideoDecoder
 from hma_data.sources.common.video_file import VideoFile, frame_table
 from hma_data.tokenizers.training.frames import read_pictures
-from tests.data.videos import HEIGHT, WIDTH, encode, number_of, picture
+from tests.data.videos import HEIGHT, WIDTH, encode, in_order, number_of, picture
 
 N = 26
 X264, AV1 = ("libx264", {"crf": "4"}), ("libsvtav1", {"crf": "10", "preset": "12"})
@@ -99,11 +98,6 @@ def video(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
         return KINDS[request.param](tmp_path_factory.mktemp("kinds"))
     except (ValueError, av.error.FFmpegError) as fault:
         pytest.skip(f"this PyAV cannot encode it: {fault}")
-
-
-def in_order(path: Path) -> np.ndarray[Any, Any]:
-    with av.open(str(path)) as container:
-        return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
 
 
 def test_all_frames_are_those_of_decoding_in_order(video: Path) -> None:
