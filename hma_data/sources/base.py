@@ -167,6 +167,12 @@ def compose(vector: Vector, pieces: Sequence[NDArray[Any]], where: str) -> NDArr
     return np.concatenate(parts, axis=1)
 
 
+def read_vector(vector: Vector, read: Callable[[str], NDArray[Any]], where: str) -> NDArray[np.float32]:
+    """Return a vector over time; `read` returns the recorded values of a key, and is asked once for each."""
+    values = {key: read(key) for key in dict.fromkeys(part.key for part in vector.components)}
+    return compose(vector, [values[part.key] for part in vector.components], where)
+
+
 def component_values(part: Any, piece: NDArray[Any], where: str) -> NDArray[np.float32]:
     """Return the values (T, dims) float32 of one component; see `compose`."""
     if piece.dtype.kind not in "fiub":

@@ -31,7 +31,7 @@ from hma_data.sources.bags.container import (
 from hma_data.sources.bags.mcap import MAGIC as MCAP_MAGIC
 from hma_data.sources.bags.mcap import McapFile
 from hma_data.sources.bags.ros_files import SQLITE_MAGIC, Ros1File, SqliteFile
-from hma_data.sources.common.places import file_fingerprint, first_bytes, leaves
+from hma_data.sources.common.places import file_fingerprint, first_bytes, require_inside
 from hma_data.storage.fetch import mark
 from hma_data.storage.remote import RemotePath, is_remote
 from hma_data.storage.yaml_io import read_yaml
@@ -73,10 +73,9 @@ class Bag:
         self._counts: Counter[Channel] | None = None
         root = root or path
         for item in () if is_remote(path) else self._paths:
-            if item != root and leaves(item, root if root.is_dir() else root.parent):
-                raise EpisodeError(
-                    item, "is a link to a file outside its folder", "copy the file in, or give its own path"
-                )
+            if item != root:
+                remedy = "copy the file in, or give its own path"
+                require_inside(item, root if root.is_dir() else root.parent, remedy)
 
     def files(self) -> list[Container]:
         """Return its files in recording order.

@@ -41,8 +41,7 @@ from hma_data.sources.bags.topic_track import Field, TopicTrack, camera_stream, 
 from hma_data.sources.common import checks
 from hma_data.sources.common.checks import Finding, measure, skew
 from hma_data.sources.common.inspection import Inspection, KeyInfo, Timing, TopicInfo
-from hma_data.sources.common.places import unfollowed
-from hma_data.sources.common.survey import Survey, sampled
+from hma_data.sources.common.survey import Survey
 
 MAX_BYTES = 1 << 30  # of messages measured, over all bags
 MAX_MESSAGES = 300_000
@@ -146,8 +145,7 @@ def report(uri: str, root: Path, bags: dict[str, list[Path]], episodes: int) -> 
         SourceError: none of them can be read.
     """
     survey, budget = Survey(len(bags), alone=len(bags) == 1, by_field=True), _Budget()
-    for link in unfollowed(root, {paths[0] for paths in bags.values()}):
-        survey.note(link)
+    survey.links(root, {paths[0] for paths in bags.values()})
     held: dict[str, list[Path]] = {}  # the bags with messages: an open one keeps its index and unpacked files
     lengths: list[Counter[str]] = []  # of each bag: messages by topic
     for name, paths in bags.items():
@@ -167,8 +165,7 @@ def report(uri: str, root: Path, bags: dict[str, list[Path]], episodes: int) -> 
             survey.note(Finding("readable", "info", f"{path}: holds no messages"))
     first: _BagInspection | None = None
     clocks: list[dict[str, _Clock]] = []
-    names = list(held)
-    for name in [names[i] for i in sampled(len(names), episodes)] if names else []:
+    for name in survey.sample(list(held), episodes):
         path, *parts = held[name]
         try:
             bag = bag if len(bags) == 1 else Bag(path, root, parts)

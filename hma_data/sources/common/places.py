@@ -6,7 +6,7 @@ import re
 from collections.abc import Collection
 from pathlib import Path
 
-from hma_data.errors import SourceError
+from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.common.checks import Finding
 from hma_data.storage.kinds import unreadable
 from hma_data.storage.remote import LargeFile, is_remote, place
@@ -79,15 +79,16 @@ def named_files(uri: str, suffixes: Collection[str], what: str) -> dict[str, Pat
     return found
 
 
-def leaves(path: Path, folder: Path) -> bool:
-    """Check whether a path leads out of its folder by a link or `..`.
+def require_inside(path: Path, folder: Path, remedy: str = "copy the file in") -> None:
+    """Raise EpisodeError if a path leads out of the folder of its recording by a link or `..`.
 
     The Hugging Face Hub's cache keeps the files of a snapshot as links to its blobs, which may be followed.
     """
     inside, target = folder.resolve(), path.resolve()
     hub = next((above.parent for above in inside.parents if above.name == "snapshots"), None)
     homes = (inside, hub / "blobs") if hub else (inside,)
-    return not any(target.is_relative_to(home) for home in homes)
+    if not any(target.is_relative_to(home) for home in homes):
+        raise EpisodeError(path, "is a link to a file outside its folder", remedy)
 
 
 def first_bytes(path: Path, count: int) -> bytes:

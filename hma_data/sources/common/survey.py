@@ -8,9 +8,10 @@ T samples of a key in an episode, A values a sample.
 """
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from hma_data.errors import HMAError
 from hma_data.sources.common import checks
 from hma_data.sources.common.checks import CameraLook, Finding, Severity, StreamTimes, is_times, seconds_of
 from hma_data.sources.common.inspection import Inspection, KeyInfo
+from hma_data.sources.common.places import unfollowed
 
 CHECKS = {  # the checks of an inspection, in the order they are printed
     "readable": "episodes that can be read",
@@ -186,6 +188,11 @@ class Survey:
         for run in checks.runs(checks.choose(series.count, self.pairs, series.starts)):
             for start, images in checks.stacked(frames(run)):
                 self.pictures(name, key, images, run[start : start + len(images)], series.codec)
+
+    def links(self, root: Path, told: Collection[Path] = ()) -> None:
+        """Note the links under a folder that are not followed; see `unfollowed`."""
+        for found in unfollowed(root, told):
+            self.note(found)
 
     def episode(self, name: str) -> None:
         """Note that an episode is sampled."""

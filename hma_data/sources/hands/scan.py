@@ -20,7 +20,7 @@ from hma_data.errors import EpisodeError, HMAError
 from hma_data.registry.components import HandsLayout
 from hma_data.sources.common.checks import Finding
 from hma_data.sources.common.inspection import Inspection, KeyInfo
-from hma_data.sources.common.places import file_fingerprint, local_path, unfollowed
+from hma_data.sources.common.places import file_fingerprint, local_path
 from hma_data.sources.common.survey import Series, Survey, sampled
 from hma_data.sources.common.video_file import VideoFile
 from hma_data.sources.hands.detect import VERSION, Hand, HandModels, MediaPipeHands
@@ -105,8 +105,7 @@ def inspect_videos(uri: str, episodes: int) -> Inspection:
     """Inspect hand videos: sizes, rates, codecs, and the share of frames that show hands."""
     videos = videos_of(uri)
     survey = Survey(len(videos))
-    for link in unfollowed(local_path(uri)):
-        survey.note(link)
+    survey.links(local_path(uri))
     beside = Counter(item.suffix.lower() for item in _near(local_path(uri)))
     if tables := ", ".join(f"{beside[suffix]:,} {suffix}" for suffix in TABLE_SUFFIXES if beside[suffix]):
         said = f"these videos are read as videos of hands; next to them are {tables}"

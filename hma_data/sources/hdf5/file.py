@@ -166,8 +166,8 @@ class EpisodeGroup:
 class EpisodeFinder:
     """The episodes of recordings, by their ids; the episodes of each file are remembered."""
 
-    def __init__(self, files: OpenFiles) -> None:
-        self._files = files
+    def __init__(self) -> None:
+        self.files = OpenFiles()
         self._stems: dict[str, dict[str, Path]] = {}
         self._seen: dict[tuple[Path, str | None], dict[str, EpisodeGroup]] = {}
 
@@ -234,13 +234,13 @@ class EpisodeFinder:
         """Return the episode's group, in the open file."""
         if place.fault:
             raise EpisodeError(place, *place.fault)
-        return member(self._files.get(place.file), place.group, str(place))
+        return member(self.files.get(place.file), place.group, str(place))
 
     def _inside(self, file: Path, pattern: str | None) -> dict[str, EpisodeGroup]:
         """Return the episodes of one file by name within it; the name of a whole file is empty."""
         if (file, pattern) not in self._seen:
             with explained(file, SourceError):
-                self._seen[file, pattern] = _episodes(self._files.get(file), file, pattern)
+                self._seen[file, pattern] = _episodes(self.files.get(file), file, pattern)
         return self._seen[file, pattern]
 
 

@@ -14,7 +14,7 @@ from hma_data.episodes.episode import Floats, stacked
 from hma_data.episodes.images import Images, decode_image
 from hma_data.errors import EpisodeError
 from hma_data.registry.components import Hdf5Layout
-from hma_data.sources.hdf5.file import EpisodeFinder, EpisodeGroup, OpenFiles, dataset, explained, rows
+from hma_data.sources.hdf5.file import EpisodeFinder, EpisodeGroup, dataset, explained, rows
 
 PIXELS = {"0-1": 1.0, "0-255": 255.0, "0-65535": 65535.0}
 LEAST_SIDE = 16  # pixels: a smaller array of other numbers than uint8 is not taken for images
@@ -124,7 +124,7 @@ class ImageRows:
     """A camera's Stream: the images of one dataset, `rows` in all.
 
     Args:
-        finder, files: of the source; the dataset is kept open in `files`.
+        finder: of the source; the dataset is kept open in its files.
         place, key: the episode, and the dataset in it.
         layout: of the source, from the YAML.
         times: (T,) seconds of the frames; rows after the last one are not used.
@@ -136,14 +136,13 @@ class ImageRows:
     def __init__(
         self,
         finder: EpisodeFinder,
-        files: OpenFiles,
         place: EpisodeGroup,
         key: str,
         layout: Hdf5Layout,
         times: Floats = NO_TIMES,
     ) -> None:
         self.timestamps = times
-        self._finder, self._files, self._place = finder, files, place
+        self._finder, self._place = finder, place
         self._key, self._layout, self._where = key, layout, f"{place} {key}"
         found = dataset(finder.group(place), key, str(place))
         self.rows = len(found)
@@ -157,8 +156,8 @@ class ImageRows:
     def each(self, indices: Sequence[int] | NDArray[np.int64], least: int = 0) -> Images | list[Images]:
         """Return the images of those frames, which may differ in size where each is encoded."""
         with explained(self._place):
-            group = self._finder.group(self._place)
-            found = rows(self._files.cached(self._place.file, group, self._key, str(self._place)), indices)
+            group, where = self._finder.group(self._place), str(self._place)
+            found = rows(self._finder.files.cached(self._place.file, group, self._key, where), indices)
         if self._kind == "raw":
             return as_rgb(
                 as_bytes(found, self._layout, self._where), axes_of(found.shape, self._layout, self._where)

@@ -4,12 +4,13 @@ import math
 from collections import Counter
 from collections.abc import Container, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from hma_data.episodes.images import decode_image, image_codec
 from hma_data.errors import EpisodeError, HMAError
@@ -17,14 +18,13 @@ from hma_data.registry.components import Hdf5Layout
 from hma_data.sources.common import checks
 from hma_data.sources.common.checks import Finding, is_times, seconds_a_unit
 from hma_data.sources.common.inspection import Inspection, KeyInfo
-from hma_data.sources.common.places import local_path, unfollowed
+from hma_data.sources.common.places import local_path
 from hma_data.sources.common.survey import MAX_LENGTHS, MAX_VALUES, Series, Survey, listed
 from hma_data.sources.hdf5.file import (
     TEXT_KEYS,
     WHOLE_FILE,
     EpisodeFinder,
     EpisodeGroup,
-    OpenFiles,
     RecordedRows,
     dataset,
     explained,
@@ -46,21 +46,19 @@ _MEASURED = "measured from"
 _SIMULATORS = {1: "robosuite", 2: "gym", 3: "iGibson"}  # robomimic's env_args.type
 
 
-@dataclass
+@dataclass(frozen=True)
 class _First:
     """The facts of the first readable episode, which stand for all."""
 
-    name: str = ""
-    keys: dict[str, KeyInfo] = field(default_factory=dict)
-    facts: dict[str, str] = field(default_factory=dict)
-    pixels: dict[str, str] = field(default_factory=dict)  # camera -> range, where it is not uint8
-    rate: float | None = None
-    robots: Any = None
+    name: str
+    keys: dict[str, KeyInfo]
+    facts: dict[str, str]
+    pixels: dict[str, str]  # camera -> range, where it is not uint8
+    rate: float | None
+    robots: Any
 
 
-def inspect(
-    uri: str, finder: EpisodeFinder, files: OpenFiles, episodes: int, pattern: str | None = None
-) -> Inspection:
+def inspect(uri: str, finder: EpisodeFinder, episodes: int, pattern: str | None = None) -> Inspection:
     """See Source.inspect; `pattern` names the groups that are episodes, by default the file shows it.
 
     Raises:
@@ -68,10 +66,9 @@ def inspect(
     """
     found = finder.all(uri, pattern)
     order = list(found)
-    survey, first = Survey(len(order)), _First()
+    survey, first = Survey(len(order)), _First("", {}, {}, {}, None, None)
     chosen = survey.sample(order, episodes)
-    for link in unfollowed(local_path(uri)):
-        survey.note(link)
+    survey.links(local_path(uri))
     lengths: dict[str, int] = {}
     held: Counter[str] = Counter()
     for name in dict.fromkeys([*order[:MAX_LENGTHS], *chosen]):
@@ -88,23 +85,22 @@ def inspect(
                 survey.note(Finding("rows", "info", said, numbers={"rows": unused}))
             sizes = {key: recorded.of(size) for key, size in sizes.items()}
             if not first.keys:
-                first.name = name
-                _tell(first, group, files, place)
+                first = _first(name, group, place)
                 _end_to_end(name, group, place, survey)
             held.update(sizes)
             series = [key for key, info in first.keys.items() if info.kind in ("camera", "vector")]
             series = [key for key in series if not is_video(key)]
             survey.lengths(name, lengths[name], sizes, series)
             if name in chosen:
-                looked = _Looked(name, place, finder, files, first, recorded)
-                keys = {key: partial(looked.series, key) for key in series if key in sizes}
+                opened = partial(_series, name, place, finder, first, recorded)
+                keys = {key: partial(opened, key) for key in series if key in sizes}
                 measured = first.facts["rate"].startswith(_MEASURED)
                 source = f"{first.name} at" if measured else "the recording states"
                 survey.look(name, keys, first.rate, source)
     for file in {found[name].file for name in chosen}:
         masks: dict[str, set[str]] = {}
         with suppress(HMAError), explained(file):  # what a damaged file lacks is told of its episodes
-            masks = masks_of(files.get(file))
+            masks = masks_of(finder.files.get(file))
         demos = {place.group.rsplit("/", 1)[-1] for place in found.values() if place.file == file}
         for mask, names in masks.items():
             if absent := sorted(names - demos):
@@ -120,18 +116,17 @@ def inspect(
     return survey.inspection("hdf5", uri, keys_told, every, first.facts, hz=first.rate, robot=robot)
 
 
-def _tell(first: _First, group: h5py.Group, files: OpenFiles, place: EpisodeGroup) -> None:
-    said = _environment(files.get(place.file))
-    first.robots = said.get("robots")
-    first.pixels = _pixels(group)
-    first.keys = {info.key: info for info in _keys(group, place, first.pixels)}
-    first.facts = _facts(group, said, place)
-    first.facts["pixels"] = next(iter(first.pixels.values()), "")
-    if all(info.kind != "camera" for info in first.keys.values()):
-        first.facts["videos beside it"] = listed(videos_beside(place.file))
+def _first(name: str, group: h5py.Group, place: EpisodeGroup) -> _First:
+    said, pixels = _environment(group.file), _pixels(group)
+    keys = {info.key: info for info in _keys(group, place, pixels)}
+    facts = _facts(group, said, place)
+    facts["pixels"] = next(iter(pixels.values()), "")
+    if all(info.kind != "camera" for info in keys.values()):
+        facts["videos beside it"] = listed(videos_beside(place.file))
         films = video_keys(place.file) if place.group == WHOLE_FILE else ()
-        first.keys |= {info.key: info for info in films}
-    first.rate, first.facts["rate"], first.facts["timestamps"] = _rate(group, said, first.keys, str(place))
+        keys |= {info.key: info for info in films}
+    rate, facts["rate"], facts["timestamps"] = _rate(group, said, keys, str(place))
+    return _First(name, keys, facts, pixels, rate, said.get("robots"))
 
 
 def _end_to_end(name: str, group: h5py.Group, place: EpisodeGroup, survey: Survey) -> None:
@@ -161,32 +156,23 @@ def _environment(handle: h5py.File) -> dict[str, Any]:
     return {**found, **inner} if isinstance(inner, dict) else found
 
 
-@dataclass
-class _Looked:
-    """An episode that is looked into."""
+def _series(
+    name: str, place: EpisodeGroup, finder: EpisodeFinder, first: _First, recorded: RecordedRows, key: str
+) -> Series:
+    """Return how a key of an episode is read."""
+    info, group = first.keys[key], finder.group(place)
+    size = dataset(group, key, name).size
+    if info.kind == "camera":
+        layout = Hdf5Layout.model_validate({"pixels": first.pixels.get(key)})
+        images = ImageRows(finder, place, key, layout)
+        return Series(None, images.each, recorded.of(images.rows), codec=info.codec)
 
-    name: str
-    place: EpisodeGroup
-    finder: EpisodeFinder
-    files: OpenFiles
-    first: _First
-    recorded: RecordedRows
+    def values() -> NDArray[Any]:
+        with explained(f"{name} {key}"):
+            found = numbers(group, key, name)
+        return found[: recorded.of(len(found))]
 
-    def series(self, key: str) -> Series:
-        """Return how a key is read."""
-        info = self.first.keys[key]
-        group = self.finder.group(self.place)
-        size = dataset(group, key, self.name).size
-        if info.kind == "camera":
-            layout = Hdf5Layout.model_validate({"pixels": self.first.pixels.get(key)})
-            images = ImageRows(self.finder, self.files, self.place, key, layout)
-            return Series(None, images.each, self.recorded.of(images.rows), codec=info.codec)
-        return Series(partial(self._numbers, group, key)) if size <= MAX_VALUES else Series()
-
-    def _numbers(self, group: h5py.Group, key: str) -> Any:
-        with explained(f"{self.name} {key}"):
-            values = numbers(group, key, self.name)
-        return values[: self.recorded.of(len(values))]
+    return Series(values) if size <= MAX_VALUES else Series()
 
 
 def _pixels(group: h5py.Group) -> dict[str, str]:

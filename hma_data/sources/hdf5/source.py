@@ -30,9 +30,9 @@ from numpy.typing import NDArray
 
 from hma_data.episodes.episode import Episode, Floats, Signal, Stream, rate_times
 from hma_data.errors import EpisodeError, HMAError, SourceError
-from hma_data.registry.components import Hdf5Layout, Vector
+from hma_data.registry.components import Hdf5Layout
 from hma_data.registry.embodiment import Embodiment
-from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose
+from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, read_vector
 from hma_data.sources.common.checks import seconds_a_unit, seconds_of
 from hma_data.sources.common.places import file_fingerprint
 from hma_data.sources.common.video_file import FilmRows, VideoFile
@@ -41,7 +41,6 @@ from hma_data.sources.hdf5.file import (
     WHOLE_FILE,
     EpisodeFinder,
     EpisodeGroup,
-    OpenFiles,
     RecordedRows,
     dataset,
     explained,
@@ -77,17 +76,15 @@ class Hdf5Source:
     """A reader of HDF5 recordings; see the module."""
 
     def __init__(self) -> None:
-        self._files = OpenFiles()
-        self._finder = EpisodeFinder(self._files)
+        self._finder = EpisodeFinder()
 
     def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
         """See Source."""
-        return inspect(as_text(uri), self._finder, self._files, episodes)
+        return inspect(as_text(uri), self._finder, episodes)
 
     def inspect_as(self, uri: StrPath, embodiment: Embodiment, episodes: int = SAMPLE) -> Inspection:
         """See LaidOut."""
-        pattern = layout_of(embodiment).episodes
-        return inspect(as_text(uri), self._finder, self._files, episodes, pattern)
+        return inspect(as_text(uri), self._finder, episodes, layout_of(embodiment).episodes)
 
     def episode_ids(self, uri: StrPath) -> list[str]:
         """Return the episode ids, with files by name and `demo_2` before `demo_10`."""
@@ -108,7 +105,7 @@ class Hdf5Source:
             films = video_fingerprints(file, embodiment.cameras, layout) if embodiment else ""
             whole = any(place.group == WHOLE_FILE for place in places.values())
             with explained(file, SourceError):
-                masks = {} if whole else masks_of(self._files.get(file))
+                masks = {} if whole else masks_of(self._finder.files.get(file))
             known |= set(masks)
             for episode_id, place in places.items():
                 name = place.group.rsplit("/", 1)[-1]
@@ -134,14 +131,15 @@ class Hdf5Source:
         where = str(place)
         with explained(where):
             group = self._finder.group(place)
-            actions = _vector(group, embodiment.action, where)
+            read = partial(numbers, group, where=where)
+            actions = read_vector(embodiment.action, read, where)
             recorded = RecordedRows(group, len(actions))
             check = partial(_check_length, layout, where, recorded)
             times = _times(group, embodiment, layout, recorded, where)
             check(layout.timestamps or "", len(times))
             observed: NDArray[np.float32] | None = None
             if embodiment.state:
-                observed = _vector(group, embodiment.state, where)
+                observed = read_vector(embodiment.state, read, where)
                 check(embodiment.state.components[0].key, len(observed))
             cameras: dict[str, ImageRows | FilmRows] = {}
             for camera in embodiment.cameras:
@@ -174,7 +172,7 @@ class Hdf5Source:
         self, place: EpisodeGroup, group: h5py.Group, key: str, layout: Hdf5Layout, times: Floats
     ) -> ImageRows:
         try:
-            return ImageRows(self._finder, self._files, place, key, layout, times)
+            return ImageRows(self._finder, place, key, layout, times)
         except EpisodeError as fault:
             if "states" in group and not any(image_kind(item) for _, item in walk(group)):
                 said = "holds a simulator's states and no images"
@@ -244,14 +242,6 @@ def _times(
     unit = seconds_a_unit(np.unique(times), key)
     seconds = seconds_of(times, key) if unit not in (None, 1.0) else None
     return times.astype(np.float64) if seconds is None else seconds
-
-
-def _vector(group: h5py.Group, vector: Vector, where: str) -> NDArray[np.float32]:
-    read = {key: numbers(group, key, where) for key in dict.fromkeys(part.key for part in vector.components)}
-    if len({len(values) for values in read.values()}) > 1:
-        said = ", ".join(f"{key} {len(values)}" for key, values in read.items())
-        raise EpisodeError(where, f"its series differ in length: {said}")
-    return compose(vector, [read[part.key] for part in vector.components], where)
 
 
 def _instruction(group: h5py.Group, key: str | None, where: str) -> str:

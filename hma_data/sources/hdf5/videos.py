@@ -20,7 +20,7 @@ from typing import Any
 from hma_data.errors import EpisodeError, HMAError
 from hma_data.registry.components import Camera, Hdf5Layout
 from hma_data.sources.common.inspection import KeyInfo
-from hma_data.sources.common.places import file_fingerprint, leaves
+from hma_data.sources.common.places import file_fingerprint, require_inside
 from hma_data.sources.common.video_file import VideoFile
 from hma_data.storage.files import parse_json
 
@@ -134,8 +134,7 @@ def _one(file: Path, folder: Path, pattern: str, what: str) -> Path:
             remedy = f"next to it are {', '.join(beside[:MAX_NAMES]) or 'no videos'}"
             raise EpisodeError(file, f"{what}: {fault} {pattern}", remedy)
         [path] = found
-    if leaves(path, folder):
-        raise EpisodeError(path, "is a link to a file outside its folder", "copy the file in")
+    require_inside(path, folder)
     return path
 
 

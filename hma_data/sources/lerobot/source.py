@@ -29,7 +29,7 @@ from hma_data.episodes.episode import Episode, Signal, Stream
 from hma_data.errors import EpisodeError, HMAError, SourceError
 from hma_data.registry.components import Vector
 from hma_data.registry.embodiment import Embodiment
-from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, compose
+from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, read_vector
 from hma_data.sources.common import checks
 from hma_data.sources.common.checks import Finding
 from hma_data.sources.common.inspection import KeyInfo
@@ -200,8 +200,7 @@ def _video_sample(path: Path) -> str:
 
 
 def _vector(rows: Rows, vector: Vector) -> NDArray[np.float32]:
-    pieces = {part.key: rows.numbers(part.key) for part in vector.components}
-    return compose(vector, [pieces[part.key] for part in vector.components], str(rows.path))
+    return read_vector(vector, rows.numbers, str(rows.path))
 
 
 def _instruction(rows: Rows, key: str | None, tasks: list[str]) -> str:

@@ -36,7 +36,7 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import SAMPLE, EpisodeRef, component_values
 from hma_data.sources.common.inspection import Inspection, KeyInfo
 from hma_data.sources.common.pickles import read_dict
-from hma_data.sources.common.places import file_fingerprint, leaves, local_path, nothing_there, unfollowed
+from hma_data.sources.common.places import file_fingerprint, local_path, nothing_there, require_inside
 from hma_data.sources.common.survey import Series, Survey
 from hma_data.sources.common.video_file import FilmRows, VideoFile
 from hma_data.sources.rh20t import SCENE
@@ -107,8 +107,7 @@ class Scene:
         if not camera.startswith(CAMERA) or Path(camera).name != camera or not path.is_file():
             there = f"it has {', '.join(self.cameras) or 'no films'}"
             raise EpisodeError(self.folder, f"has no {camera}/{FILM}", there)
-        if leaves(path, self.folder):
-            raise EpisodeError(path, "is a link to a file outside its folder", "copy the file in")
+        require_inside(path, self.folder)
         return path
 
     def stamps(self, camera: str) -> NDArray[np.int64]:
@@ -178,8 +177,7 @@ class Scene:
         return ""
 
     def _table(self, name: str, path: Path) -> dict[Any, Any]:
-        if Path(name).name != name or leaves(path, self.folder):
-            raise EpisodeError(path, "lies outside the scene's folder", "copy the file in")
+        require_inside(path, self.folder)
         if not path.is_file():
             known = f"{TABLES} has {', '.join(self.tables) or 'none'}"
             raise EpisodeError(self.folder, f"has no {TABLES}/{name}.npy", known)
@@ -376,8 +374,7 @@ def inspect(uri: str, episodes: int) -> Inspection:
     """
     found = scenes(uri)
     survey = Survey(len(found))
-    for link in unfollowed(local_path(uri)):
-        survey.note(link)
+    survey.links(local_path(uri))
     lengths: list[int] = []
     told = ""
     for name in survey.sample(list(found), episodes):

@@ -24,7 +24,7 @@ from hma_data.episodes.images import image_codec
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.components import Component, Vector
 from hma_data.registry.embodiment import Embodiment
-from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, KeyInfo, compose
+from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, KeyInfo, read_vector
 from hma_data.sources.common.checks import Finding
 from hma_data.sources.common.survey import Series, Survey
 from hma_data.sources.rlds.example import Example
@@ -245,10 +245,9 @@ def _described(feature: RldsFeature) -> str:
 def _signals(steps: Steps, vector: Vector | None, times: Floats) -> tuple[Signal, ...]:
     if vector is None:
         return ()
-    found = {key: steps.numbers(key) for key in dict.fromkeys(part.key for part in vector.components)}
     # Without the padding that a last step may have; see `_ends_with_padding`.
-    pieces = [found[part.key][: len(times)] for part in vector.components]
-    return (Signal(times, compose(vector, pieces, steps.name)),)
+    values = read_vector(vector, lambda key: steps.numbers(key)[: len(times)], steps.name)
+    return (Signal(times, values),)
 
 
 def _require_one_episode(steps: Steps) -> None:

@@ -392,3 +392,17 @@ def test_raw_robosuite_is_listed(real_data: Path, task: str, length: int) -> Non
     found = open_source("hdf5").inspect(str(real_data / "hdf5" / f"robosuite_{task}"))
     assert found.episodes == 1 and found.lengths == (length,) and found.robot == "Panda"
     assert {info.key for info in found.keys} == {"states", "actions", "joint_torques"}
+
+
+def test_an_inspection_goes_on_after_a_first_episode_whose_times_cannot_be_read(tmp_path):
+    path = tmp_path / "demos.hdf5"
+    with h5py.File(path, "w") as file:
+        for i in range(3):
+            fill(file.create_group(f"data/demo_{i}"), seed=i)
+            file[f"data/demo_{i}/time"] = np.arange(T) / 20
+        del file["data/demo_0/time"]
+        file.create_dataset("data/demo_0/time", shape=(1 << 27,), dtype="f8", chunks=(1 << 10,))
+    seen = open_source("hdf5").inspect(path)
+    [fault] = [found for found in seen.findings if found.check == "readable"]
+    assert "'time' has shape (134217728,), too large" in fault.message and "demo_0" in fault.message
+    assert seen.hz == 20 and seen.lengths == (T, T, T)
