@@ -128,10 +128,16 @@ def _by_listing(uri: str, known: Recognitions) -> str | None:
         names = [path.name for path in place(uri).iterdir()]
     except HMAError:  # a server that lists nothing
         return None
+    by_ending = (k for k, v in known.items() if any(item.endswith(v.endings) for item in names))
+    return _by_pattern(names, known) or next(by_ending, None)
+
+
+def _by_pattern(names: Sequence[str], known: Recognitions) -> str | None:
+    """Return the format that has a pattern of one of the files' names."""
     for name, recognition in known.items():
         if any(fnmatchcase(item, pattern) for item in names for pattern in recognition.names):
             return name
-    return next((k for k, v in known.items() if any(item.endswith(v.endings) for item in names)), None)
+    return None
 
 
 def by_files(path: Path, files: Sequence[Path], known: Recognitions) -> str | None:
@@ -139,9 +145,8 @@ def by_files(path: Path, files: Sequence[Path], known: Recognitions) -> str | No
     for name, recognition in known.items():
         if any((path / place).is_file() for place in recognition.layout):
             return name
-    for name, recognition in known.items():
-        if any(fnmatchcase(file.name, pattern) for file in files for pattern in recognition.names):
-            return name
+    if found := _by_pattern([file.name for file in files], known):
+        return found
     for file in files:
         head = first_bytes(file, 32)
         for name, recognition in known.items():
@@ -164,7 +169,7 @@ def of_another_format(uri: str, name: str, fault: SourceError) -> SourceError:
     if found := misplaced(here, "a recording"):
         return SourceError(fault.where, *found)
     try:
-        known = detect(uri) if Path(uri.removeprefix("file://")).expanduser().exists() else name
+        known = detect(uri) if here.exists() else name
     except SourceError:
         known = name
     if known == name:

@@ -233,14 +233,12 @@ def seconds_a_unit(values: NDArray[Any], key: str = "") -> float | None:
     if len(times) < 3 or not np.isfinite(times).all() or steps.min() < 0 or not steps.max() > 0:
         return None
     step = float(np.median(steps))
-    for least, unit in UNITS:
-        if times[0] >= least:
-            return unit if STEPS_S[0] <= step * unit <= STEPS_S[1] else None
-    if (named := TIMES.fullmatch(key.lower())) and named[4]:
-        unit = NAMED_UNITS[named[4]]
-        return unit if STEPS_S[0] <= step * unit <= STEPS_S[1] else None
-    counted = np.array_equal(times, np.round(times))  # frame numbers, or times in another unit
-    return 1.0 if not counted and STEPS_S[0] <= step <= STEPS_S[1] else None
+    unit = next((unit for least, unit in UNITS if times[0] >= least), None)
+    if unit is None and (named := TIMES.fullmatch(key.lower())):
+        unit = NAMED_UNITS.get(named[4])
+    if unit is None and not np.array_equal(times, np.round(times)):  # else frame numbers, or another unit
+        unit = 1.0
+    return unit if unit and STEPS_S[0] <= step * unit <= STEPS_S[1] else None
 
 
 def is_times(key: str, shape: tuple[int, ...]) -> bool:

@@ -1,6 +1,6 @@
 """Read annotations of hands in videos, by video.
 
-- `landmarks`: the toolkit's own table, see HandTable.
+- `landmarks`: the toolkit's own table, see table_labels.
 - `epic_kitchens_hand_objects`: EPIC-KITCHENS-100's published hand-object detections, one pickle a video.
 - `ego4d_fho`: Ego4D's fho_main.json. Boxes (x, y, width, height in pixels) of left_hand and
   right_hand in a few frames of each narrated action; rejected and invalid actions are left out.
@@ -14,6 +14,8 @@ R rows of a table, one a hand.
 
 import json
 import re
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -33,11 +35,16 @@ JOINTS = ("wrist", *(f"{finger}_{i}" for finger in _FINGERS for i in (1, 2, 3, 4
 _FHO = "give fho_main.json of the annotations that Ego4D's command fetches (benchmark FHO)"
 
 
-def open_labels(layout: HandsLayout, uri: str) -> "LabelSet":
-    """Return the labels that belong to the videos of `uri`.
+@dataclass(frozen=True)
+class LabelSet:
+    """The labels of some videos."""
 
-    The result has `known`, the names that the labels use for their videos, and `of`, the labels of a video;
-    that raises EpisodeError where they are damaged.
+    known: list[str]  # the names that the labels use for their videos
+    of: Callable[[Video], HandLabels | None]  # None without labels; raises EpisodeError for damaged ones
+
+
+def open_labels(layout: HandsLayout, uri: str) -> LabelSet:
+    """Return the labels that belong to the videos of `uri`.
 
     Raises:
         SourceError: there are none, or they have another form.
@@ -49,12 +56,12 @@ def open_labels(layout: HandsLayout, uri: str) -> "LabelSet":
         raise SourceError(root, "does not exist", "correct source.layout.annotations")
     if layout.labels == "landmarks":
         names = [stem + suffix for stem in ("hands", "landmarks") for suffix in TABLES]
-        return HandTable(_one_file(root, names), layout)
+        return table_labels(_one_file(root, names), layout)
     if layout.labels == "ego4d_fho":
-        return Ego4dFho(_one_file(root, ["fho_main.json"]), layout)
+        return _fho_labels(_one_file(root, ["fho_main.json"]), layout)
     if layout.labels == "egoexo4d_hand_pose":
-        return EgoExoHands(_label_files(root, (".json",)), layout, root)
-    return EpicHands(_label_files(root, PICKLES), layout)
+        return _egoexo_labels(_label_files(root, (".json",)), layout, root)
+    return _epic_labels(_label_files(root, PICKLES), layout)
 
 
 def _one_file(root: Path, names: list[str]) -> Path:
@@ -91,8 +98,8 @@ _FORMS: dict[str, tuple[str, ...]] = {
 }
 
 
-class HandTable:
-    """A table of hands, by video: parquet or CSV, one row a hand.
+def table_labels(path: Path, layout: HandsLayout) -> LabelSet:
+    """Return the labels of a table of hands: parquet or CSV, one row a hand.
 
     | column | meaning |
     |---|---|
@@ -115,51 +122,48 @@ class HandTable:
         SourceError: it cannot be read, lacks a column, or has another kind of value.
     """
 
-    def __init__(self, path: Path, layout: HandsLayout) -> None:
-        import pyarrow as pa
-        import pyarrow.csv
-        import pyarrow.parquet as pq
+    import pyarrow as pa
+    import pyarrow.csv
+    import pyarrow.parquet as pq
 
-        try:
-            if path.suffix.lower() == ".csv":
-                text = dict.fromkeys(("video", "side"), pa.string())
-                options = pyarrow.csv.ConvertOptions(column_types=text)
-                table = pyarrow.csv.read_csv(path, convert_options=options)
-            else:
-                table = pq.read_table(path)
-            columns = dict(zip(table.column_names, table.columns, strict=True))
-            absent = [name for name in ("video", "frame", "side") if name not in columns]
-            if absent or not table.num_rows:
-                fault = f"has no column {absent[0]!r}" if absent else "has no rows"
-                raise SourceError(path, fault, f"its columns: {', '.join(columns)}")
-            numbers = _numbers(columns["frame"])
-            self._scores = _numbers(columns["score"]) if "score" in columns else np.ones(len(numbers))
-            self._parts = _parts(columns, path)
-        except (pa.ArrowException, OSError, ValueError) as fault:
-            said = " ".join(f"cannot be read: {fault}".split())
-            raise SourceError(path, said, "write the table again as parquet or CSV") from fault
-        sides = columns["side"].to_pylist()
-        if unknown := set(sides) - set(SIDES):
-            raise SourceError(path, f"column 'side' holds {unknown.pop()!r}", "allowed: left, right")
-        self._sides = np.array([SIDES.index(side) for side in sides], np.int64)
-        good = np.isfinite(numbers) & ~(self._scores < layout.min_score)
-        self._frames = np.where(good, numbers, 0).astype(np.int64) - layout.frame_offset
-        names, number = np.unique(np.array(columns["video"].to_pylist(), str), return_inverse=True)
-        order = np.argsort(number, kind="stable")
-        ends = np.cumsum(np.bincount(number))
-        self._rows = {
-            str(name): rows[good[rows]] for name, rows in zip(names, np.split(order, ends[:-1]), strict=True)
-        }
-        self.known = list(self._rows)
+    try:
+        if path.suffix.lower() == ".csv":
+            text = dict.fromkeys(("video", "side"), pa.string())
+            options = pyarrow.csv.ConvertOptions(column_types=text)
+            table = pyarrow.csv.read_csv(path, convert_options=options)
+        else:
+            table = pq.read_table(path)
+        columns = dict(zip(table.column_names, table.columns, strict=True))
+        absent = [name for name in ("video", "frame", "side") if name not in columns]
+        if absent or not table.num_rows:
+            fault = f"has no column {absent[0]!r}" if absent else "has no rows"
+            raise SourceError(path, fault, f"its columns: {', '.join(columns)}")
+        numbers = _numbers(columns["frame"])
+        scores = _numbers(columns["score"]) if "score" in columns else np.ones(len(numbers))
+        parts = _parts(columns, path)
+    except (pa.ArrowException, OSError, ValueError) as fault:
+        said = " ".join(f"cannot be read: {fault}".split())
+        raise SourceError(path, said, "write the table again as parquet or CSV") from fault
+    stated = columns["side"].to_pylist()
+    if unknown := set(stated) - set(SIDES):
+        raise SourceError(path, f"column 'side' holds {unknown.pop()!r}", "allowed: left, right")
+    sides = np.array([SIDES.index(side) for side in stated], np.int64)
+    good = np.isfinite(numbers) & ~(scores < layout.min_score)
+    frames = np.where(good, numbers, 0).astype(np.int64) - layout.frame_offset
+    names, number = np.unique(np.array(columns["video"].to_pylist(), str), return_inverse=True)
+    order = np.argsort(number, kind="stable")
+    ends = np.cumsum(np.bincount(number))
+    rows = {str(name): mine[good[mine]] for name, mine in zip(names, np.split(order, ends[:-1]), strict=True)}
 
-    def of(self, video: Video) -> HandLabels | None:
-        """Return the labels of a video; None where it has none."""
-        name = next((alias for alias in video.aliases if alias in self._rows), None)
+    def of(video: Video) -> HandLabels | None:
+        name = next((alias for alias in video.aliases if alias in rows), None)
         if name is None:
             return None
-        rows = self._rows[name]
-        parts = {part: values[rows] for part, values in self._parts.items()}
-        return labels_from_rows(self._frames[rows], self._sides[rows], self._scores[rows], parts)
+        mine = rows[name]
+        own = {part: values[mine] for part, values in parts.items()}
+        return labels_from_rows(frames[mine], sides[mine], scores[mine], own)
+
+    return LabelSet(list(rows), of)
 
 
 def _numbers(column: Any) -> NDArray[np.float64]:
@@ -189,39 +193,38 @@ def _parts(columns: dict[str, Any], path: Path) -> dict[str, NDArray[np.float64]
 # -- EPIC-KITCHENS-100
 
 
-class EpicHands:
-    """Labels of EPIC-KITCHENS-100: `P01_01.MP4` has its labels in `P01_01.pkl`.
+def _epic_labels(files: dict[str, Path], layout: HandsLayout) -> LabelSet:
+    """Return labels of EPIC-KITCHENS-100: `P01_01.MP4` has its labels in `P01_01.pkl`.
 
     A file is a pickled list of byte strings, each a protobuf message of one frame (types.proto of
     epic-kitchens/epic-kitchens-100-hand-object-bboxes). Boxes are fractions of the image.
     """
 
-    def __init__(self, files: dict[str, Path], layout: HandsLayout) -> None:
-        self._files, self._layout = files, layout
-        self.known = list(files)
+    def of(video: Video) -> HandLabels | None:
+        path = files.get(PurePosixPath(video.name).stem)
+        return _boxes_of(path, layout) if path else None
 
-    def of(self, video: Video) -> HandLabels | None:
-        """Return the labels of a video; None where it has none."""
-        path = self._files.get(PurePosixPath(video.name).stem)
-        if path is None:
-            return None
-        looked_at, rows = [], []
-        try:
-            for message in load_plain(path.read_bytes()):
-                frame = _message_class().FromString(message)
-                index = frame.frame_number - self._layout.frame_offset
-                looked_at.append(index)
-                for hand in frame.hands:
-                    if hand.score >= self._layout.min_score:
-                        box = hand.bbox
-                        centre = ((box.left + box.right) / 2, (box.top + box.bottom) / 2)
-                        rows.append((index, hand.side, hand.score, *centre))
-        except Exception as fault:  # damaged bytes make pickle and protobuf raise a dozen different types
-            remedy = "fetch the file again, or write its hands as a table and set labels: landmarks"
-            raise EpisodeError(path, f"cannot be read as a list of messages: {fault}", remedy) from fault
-        table = np.array(rows, np.float64).reshape(-1, 5)
-        frames, sides = table[:, :2].astype(np.int64).T
-        return labels_from_rows(frames, sides, table[:, 2], {"center": table[:, 3:]}, looked_at)
+    return LabelSet(list(files), of)
+
+
+def _boxes_of(path: Path, layout: HandsLayout) -> HandLabels:
+    looked_at, rows = [], []
+    try:
+        for message in load_plain(path.read_bytes()):
+            frame = _message_class().FromString(message)
+            index = frame.frame_number - layout.frame_offset
+            looked_at.append(index)
+            for hand in frame.hands:
+                if hand.score >= layout.min_score:
+                    box = hand.bbox
+                    centre = ((box.left + box.right) / 2, (box.top + box.bottom) / 2)
+                    rows.append((index, hand.side, hand.score, *centre))
+    except Exception as fault:  # damaged bytes make pickle and protobuf raise a dozen different types
+        remedy = "fetch the file again, or write its hands as a table and set labels: landmarks"
+        raise EpisodeError(path, f"cannot be read as a list of messages: {fault}", remedy) from fault
+    table = np.array(rows, np.float64).reshape(-1, 5)
+    frames, sides = table[:, :2].astype(np.int64).T
+    return labels_from_rows(frames, sides, table[:, 2], {"center": table[:, 3:]}, looked_at)
 
 
 @cache
@@ -250,23 +253,17 @@ def _message_class() -> Any:
 # -- Ego4D
 
 
-class Ego4dFho:
-    """Labels of Ego4D; a video's name is its uid."""
-
-    def __init__(self, path: Path, layout: HandsLayout) -> None:
-        try:
-            videos = json.loads(path.read_bytes(), object_hook=_compact)["videos"]
-            labels = {str(item["uid"]): _labels_of_actions(item["actions"], layout) for item in videos}
-        except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as fault:
-            raise SourceError(path, f"is not Ego4D's fho_main.json: {fault!r}", _FHO) from fault
-        self._videos = {uid: found for uid, found in labels.items() if found}
-        if not self._videos:
-            raise SourceError(path, "has no boxes of hands", _FHO)
-        self.known = list(self._videos)
-
-    def of(self, video: Video) -> HandLabels | None:
-        """Return the labels of a video; None where it has none."""
-        return self._videos.get(PurePosixPath(video.name).stem)
+def _fho_labels(path: Path, layout: HandsLayout) -> LabelSet:
+    """Return labels of Ego4D; a video's name is its uid."""
+    try:
+        videos = json.loads(path.read_bytes(), object_hook=_compact)["videos"]
+        labels = {str(item["uid"]): _labels_of_actions(item["actions"], layout) for item in videos}
+    except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as fault:
+        raise SourceError(path, f"is not Ego4D's fho_main.json: {fault!r}", _FHO) from fault
+    known = [uid for uid, found in labels.items() if found]
+    if not known:
+        raise SourceError(path, "has no boxes of hands", _FHO)
+    return LabelSet(known, lambda video: labels.get(PurePosixPath(video.name).stem))
 
 
 def _compact(item: dict[str, Any]) -> Any:
@@ -309,38 +306,35 @@ def _labels_of_actions(actions: list[Any], layout: HandsLayout) -> HandLabels | 
 # -- Ego-Exo4D
 
 
-class EgoExoHands:
-    """Labels of Ego-Exo4D, by take; the videos of a take lie in its folder, one a camera.
+def _egoexo_labels(files: dict[str, Path], layout: HandsLayout, root: Path) -> LabelSet:
+    """Return labels of Ego-Exo4D, by take; the videos of a take lie in its folder, one a camera.
 
     The names of the takes come from the label files, or from takes.json beside or above them. A video may
     also have the name of its take or the take's uid.
     """
+    names: dict[str, str] = {}
+    for path in (root.parent / "takes.json", root / "takes.json"):
+        try:
+            takes = json.loads(path.read_bytes()) if path.is_file() else []
+            names |= {str(take["take_uid"]): str(take["take_name"]) for take in takes}
+        except (KeyError, RecursionError, TypeError, ValueError) as fault:
+            raise SourceError(path, f"is not Ego-Exo4D's takes.json: {fault!r}") from fault
+    by_take = {uid: path for uid, path in files.items() if uid != "takes"}
+    by_name = dict(by_take)
+    for uid, path in by_take.items():
+        if uid not in names:
+            stated = re.search(rb'"take_name"\s*:\s*"([^"]+)"', first_bytes(path, 1 << 16))
+            names[uid] = stated[1].decode(errors="replace") if stated else uid
+        by_name[names[uid]] = path
 
-    def __init__(self, files: dict[str, Path], layout: HandsLayout, root: Path) -> None:
-        self._layout = layout
-        self._files = {stem: path for stem, path in files.items() if stem != "takes"}
-        names: dict[str, str] = {}
-        for path in (root.parent / "takes.json", root / "takes.json"):
-            try:
-                takes = json.loads(path.read_bytes()) if path.is_file() else []
-                names |= {str(take["take_uid"]): str(take["take_name"]) for take in takes}
-            except (KeyError, RecursionError, TypeError, ValueError) as fault:
-                raise SourceError(path, f"is not Ego-Exo4D's takes.json: {fault!r}") from fault
-        self._uids = {uid: uid for uid in self._files}
-        for uid, path in self._files.items():
-            if uid not in names:
-                stated = re.search(rb'"take_name"\s*:\s*"([^"]+)"', first_bytes(path, 1 << 16))
-                names[uid] = stated[1].decode(errors="replace") if stated else uid
-            self._uids[names[uid]] = uid
-        self.known = list(self._uids)
-
-    def of(self, video: Video) -> HandLabels | None:
-        """Return the labels of a video; None where it has none."""
+    def of(video: Video) -> HandLabels | None:
         place = PurePosixPath(video.name)
-        called = next((part for part in (place.stem, *place.parts[:-1]) if part in self._uids), None)
-        if called is None or (called != place.stem and place.stem != self._layout.camera):
+        called = next((part for part in (place.stem, *place.parts[:-1]) if part in by_name), None)
+        if called is None or (called != place.stem and place.stem != layout.camera):
             return None
-        return _joints_of(self._files[self._uids[called]], self._layout)
+        return _joints_of(by_name[called], layout)
+
+    return LabelSet(list(by_name), of)
 
 
 def _joints_of(path: Path, layout: HandsLayout) -> HandLabels:
@@ -368,6 +362,3 @@ def _joints_of(path: Path, layout: HandsLayout) -> HandLabels:
     parts = {"wrist": points[:, 0], "center": center, "landmarks": points.reshape(-1, 42)}
     scores = np.ones(len(frames))
     return labels_from_rows(np.array(frames), np.array(sides), scores, parts, looked_at, pixels=True)
-
-
-LabelSet = HandTable | EpicHands | Ego4dFho | EgoExoHands

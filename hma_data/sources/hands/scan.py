@@ -8,7 +8,7 @@ R hands found.
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -103,10 +103,11 @@ def scan_cached(path: Path, detector: MediaPipeHands, models: HandModels, layout
 
 def inspect_videos(uri: str, episodes: int) -> Inspection:
     """Inspect hand videos: sizes, rates, codecs, and the share of frames that show hands."""
-    videos = videos_of(uri)
+    videos, root = videos_of(uri), local_path(uri)
     survey = Survey(len(videos))
-    survey.links(local_path(uri))
-    beside = Counter(item.suffix.lower() for item in _near(local_path(uri)))
+    survey.links(root)
+    near = islice((root if root.is_dir() else root.parent).rglob("*"), MAX_FILES_BESIDE)
+    beside = Counter(item.suffix.lower() for item in near)
     if tables := ", ".join(f"{beside[suffix]:,} {suffix}" for suffix in TABLE_SUFFIXES if beside[suffix]):
         said = f"these videos are read as videos of hands; next to them are {tables}"
         survey.note(Finding("files", "info", said, f"for a robot's videos: {ROBOT_VIDEOS_PAGE}"))
@@ -141,11 +142,6 @@ def inspect_videos(uri: str, episodes: int) -> Inspection:
         keys.append(KeyInfo(point, "vector", (width,), "float32", hz, ("x", "y") if width == 2 else None))
     lengths = [headers[name].frames if name in headers else 0 for name in videos]
     return survey.inspection("hands", uri, keys, lengths, facts, hz=hz, robot="human hands")
-
-
-def _near(root: Path) -> Iterator[Path]:
-    """Return some of the files in the folder of the videos."""
-    return islice((root if root.is_dir() else root.parent).rglob("*"), MAX_FILES_BESIDE)
 
 
 def _film(name: str, video: Video, header: Header, survey: Survey) -> Series:

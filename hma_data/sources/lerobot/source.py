@@ -23,11 +23,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hma_data.episodes.episode import Episode, Signal, Stream
 from hma_data.errors import EpisodeError, HMAError, SourceError
-from hma_data.registry.components import Vector
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, read_vector
 from hma_data.sources.common import checks
@@ -128,11 +126,12 @@ class LeRobotSource:
         metadata: dict[str, Any] = {"flags": flags, "language": language_of(meta, rows, times)}
         if len(tasks) > 1:
             metadata["tasks"] = tasks
+        read = partial(read_vector, read=rows.numbers, where=str(rows.path))
         return Episode(
             id=episode_id,
             streams=streams,
-            actions=(Signal(times, _vector(rows, embodiment.action)),),
-            states=(Signal(times, _vector(rows, embodiment.state)),) if embodiment.state else (),
+            actions=(Signal(times, read(embodiment.action)),),
+            states=(Signal(times, read(embodiment.state)),) if embodiment.state else (),
             instruction=_instruction(rows, embodiment.source.instruction, tasks),
             success=_success(rows),
             source=str(rows.path),
@@ -197,10 +196,6 @@ def _video_sample(path: Path) -> str:
         head = file.read(_SAMPLE)
         file.seek(max(0, size - _SAMPLE))
         return hashlib.sha256(b"%d" % size + head + file.read(_SAMPLE)).hexdigest()
-
-
-def _vector(rows: Rows, vector: Vector) -> NDArray[np.float32]:
-    return read_vector(vector, rows.numbers, str(rows.path))
 
 
 def _instruction(rows: Rows, key: str | None, tasks: list[str]) -> str:
