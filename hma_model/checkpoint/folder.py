@@ -27,6 +27,7 @@ from hma_data.storage.paths import StrPath, as_path
 from hma_model.config import HMAConfig
 
 if TYPE_CHECKING:
+    from hma_data.loading.views import Cameras
     from hma_data.shards.reader import ShardSet
     from hma_data.tokenizers.base import TokenizerSpec
 
@@ -149,6 +150,17 @@ class Checkpoint:
     def cards(self, embodiments: Iterable[str] | None = None) -> dict[str, dict[str, Any]]:
         """Return the cards of embodiments by id; None means all."""
         return {name: self.card(name) for name in self.chosen(embodiments)}
+
+    def cameras(self, embodiment: str) -> "Cameras":
+        """Return the cameras that a stem was trained on, as its card names them; by default the first one."""
+        stated = value_of(self.card(embodiment).get("data"), "cameras")
+        names = [stated] if isinstance(stated, str) else stated
+        if not (isinstance(names, list) and names and all(isinstance(name, str) for name in names)):
+            return "first"
+        if len(names) != self.config.views:
+            fault = f"names {len(names)} cameras, but a frame of the model has {self.config.views}"
+            raise CheckpointError(self.path(embodiment, CARD), fault, "pull or save the checkpoint again")
+        return stated
 
     def pictures(self, embodiment: str) -> list[str]:
         """Return the names of the sample picture and film that an embodiment has."""

@@ -16,7 +16,7 @@ from hma_data.storage.paths import StrPath, as_text
 from hma_data.tokenizers.base import Tokenizer
 from hma_data.tokenizers.network import NetworkTokenizer
 from hma_model.arrays import Images
-from hma_model.checkpoint.folder import EMBEDDED_NAME, resolve, value_of
+from hma_model.checkpoint.folder import EMBEDDED_NAME, resolve
 from hma_model.network.model import HMA
 from hma_model.network.network import Network
 
@@ -54,15 +54,19 @@ def decode(tokenizer: Tokenizer, stored: Tensor) -> Images:
     return pictures.reshape(*stored.shape[:2], *pictures.shape[1:])
 
 
+def trained_cameras(model: Network, embodiment: str) -> Cameras:
+    """Return the cameras that a robot's stem was trained on; the first one if no checkpoint tells them."""
+    kept = model.source
+    return kept.cameras(embodiment) if kept and embodiment in kept.embodiments else FIRST_CAMERA
+
+
 def cameras_for(model: Network, shards: ShardSet, cameras: Cameras | None = None) -> Cameras:
     """Return the cameras that a model sees: those given, or those that it was trained on.
 
     Raises:
         UsageError: these are more or fewer than the views of the model.
     """
-    if cameras is None and model.source:
-        cameras = value_of(model.source.card(shards.embodiment.id).get("data"), "cameras")
-    cameras = FIRST_CAMERA if cameras is None else cameras
+    cameras = trained_cameras(model, shards.embodiment.id) if cameras is None else cameras
     if (count := view_count(cameras)) != model.config.views:
         fault = f"are {count} in a frame, but the model takes {model.config.views}"
         raise UsageError(

@@ -29,7 +29,7 @@ from hma_model.evaluation.recorded_state import (
 from hma_model.policies.judge import StateJudge, Task, task_of, train_judge
 from hma_model.policies.rewards import RewardModel, labelled_shards, measured_judge, names_reward_model
 from hma_model.worlds.env import WorldModelVectorEnv
-from hma_model.worlds.images import recorded_cameras, seen_cameras, trained_cameras
+from hma_model.worlds.images import recorded_cameras, seen_cameras
 from hma_model.worlds.world import World
 
 Observations = dict[str, Any]
@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 def camera_names(checkpoint: Checkpoint, embodiment: str) -> list[str]:
     """Return the names of the cameras that a model's image shows side by side."""
     stored = recorded_cameras(checkpoint.embodiment(embodiment))
-    return seen_cameras(trained_cameras(checkpoint.card(embodiment)), stored)
+    return seen_cameras(checkpoint.cameras(embodiment), stored)
 
 
 def state_source(checkpoint: Checkpoint, embodiment: str) -> Callable[[World, Tell], Reader | None] | None:

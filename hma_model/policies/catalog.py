@@ -3,6 +3,7 @@
 import pkgutil
 import re
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -74,4 +75,5 @@ def _named(words: str) -> Any:
             f"policy {words}", f"cannot be imported: {type(fault).__name__}: {fault}", remedy
         ) from fault
     finally:
-        sys.path.remove(here)  # the module may have put others before it
+        with suppress(ValueError):  # the module may have put others before it, or removed it
+            sys.path.remove(here)

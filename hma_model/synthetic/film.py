@@ -28,8 +28,9 @@ from hma_data.storage.files import file_sha256
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.arrays import Bools, Float32s
 from hma_model.checkpoint.folder import require_tokenizer
-from hma_model.generation.commands import card, described
-from hma_model.worlds.images import fitted, recorded_cameras, seen_cameras, trained_cameras
+from hma_model.generation.commands import described
+from hma_model.generation.decode import trained_cameras
+from hma_model.worlds.images import fitted, recorded_cameras, seen_cameras
 from hma_model.worlds.prompts import SeenShards
 from hma_model.worlds.world import World
 
@@ -125,7 +126,7 @@ class ShardFilm:
         self._step = step
         rows = shards.episodes.to_pylist()
         self._parts = [(row, part) for row in rows for part in episode_pieces(shards, row, step)]
-        cameras = trained_cameras(card(world.model, embodiment or shards.embodiment.id))
+        cameras = trained_cameras(world.model, embodiment or shards.embodiment.id)
         if embodiment in (None, shards.embodiment.id) or view_count(cameras) > 1:
             Views.of(shards, cameras)  # raises if one of them is not there
         self._seen = SeenShards(shards, cameras)
@@ -174,7 +175,7 @@ def _video_episodes(
     """Return an episode for each file; its frames are resized like those of the robot's camera."""
     robot = described(world.model, embodiment)
     if robot is not None:
-        robot = _seen_by(robot, trained_cameras(card(world.model, embodiment)))
+        robot = _seen_by(robot, trained_cameras(world.model, embodiment))
     found = []
     names = set[str]()
     for file in files:

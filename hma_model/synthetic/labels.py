@@ -29,12 +29,13 @@ from hma_data.storage.paths import StrPath, as_path
 from hma_model.arrays import Float32s
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.config import INVERSE
-from hma_model.generation.commands import Commands, card, yaml_of
+from hma_model.generation.commands import Commands, yaml_of
+from hma_model.generation.decode import trained_cameras
 from hma_model.network.model import HMA
 from hma_model.policies.fingerprints import device_facts, world_digests
 from hma_model.synthetic.film import FilmEpisode, ShardFilm, find_film, read_film
 from hma_model.synthetic.recorder import SyntheticEpisode, finished, write_shards
-from hma_model.worlds.images import recorded_cameras, seen_cameras, trained_cameras
+from hma_model.worlds.images import recorded_cameras, seen_cameras
 from hma_model.worlds.world import World, load_world
 
 WORK = ".label"
@@ -141,7 +142,7 @@ def label_actions(
             if not labelled:
                 fault = f"has no usable episode; the first: {refused[0].message}"
                 raise UsageError(as_path(film).name, fault, "give longer videos")
-            cameras = seen_cameras(trained_cameras(card(model, embodiment)), recorded_cameras(robot))
+            cameras = seen_cameras(trained_cameras(model, embodiment), recorded_cameras(robot))
             tokens = world.tokenizer.spec
             manifest = write_shards(folder, labelled, tokens, robot, of_film, ORIGIN, refused, cameras)
         remove_kept(folder / WORK)  # a job may have been killed here

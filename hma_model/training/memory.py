@@ -44,10 +44,10 @@ UNET_BF16_SHARE = 0.54
 def activation_bytes(config: HMAConfig, recipe: Recipe, windows: int, device: torch.device) -> float:
     """Return the bytes that a pass over B windows on a device keeps for its backward pass."""
     predicts_video = any(OBJECTIVES[name].predicts_video for name in recipe.objectives)
-    predicted = config.frames - 1 if predicts_video else 0
+    frames = recipe.frames  # a checkpoint's window may be another one
+    predicted = frames - 1 if predicts_video else 0
     if config.trunk == "unet":
         return windows * _unet_bytes(config, recipe, predicted, _score_values(config, recipe, device))
-    frames = config.frames
     if config.training_pass == "pairs" and predicts_video:
         frames += predicted  # a masked copy of each frame from the second on
     values = windows * frames * (config.tokens_per_frame + config.appended_tokens) * config.width
@@ -90,7 +90,7 @@ def _unet_bytes(config: HMAConfig, recipe: Recipe, predicted: int, scores: int) 
     if recipe.checkpointing:  # what enters each block, and the values of the one that is recomputed
         blocks = config.layers * down_and_up + UNET_VALUES * sizes[0]
     every = any(not OBJECTIVES[name].predicts_video or OBJECTIVES[name].readout for name in recipe.objectives)
-    computed = predicted + every * config.frames  # those before the predicted ones only then
+    computed = predicted + every * recipe.frames  # those before the predicted ones only then
     embedded = 2 * config.frames * places * config.views * config.width
     share = UNET_BF16_SHARE if recipe.precision == "bf16" else 1.0
     return 4.0 * (share * computed * (blocks + embedded) + predicted * scores * places * config.views)

@@ -3,22 +3,22 @@
 P images, H×W pixels, S pixels a side of the tokenizer's images, V views side by side.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from hma_data.episodes.images import decode_image, resize
 from hma_data.episodes.sheets import cell_scale, first_of_grid
 from hma_data.errors import EpisodeError, HMAError, UsageError
-from hma_data.loading.views import FIRST_CAMERA, Cameras
+from hma_data.loading.views import Cameras
 from hma_data.registry.embodiment import Embodiment
 from hma_data.storage.kinds import misplaced
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.arrays import Float32s, Images
-from hma_model.checkpoint.folder import SAMPLE, Checkpoint, value_of
+from hma_model.checkpoint.folder import SAMPLE, Checkpoint
 from hma_model.config import HMAConfig
 
 
@@ -56,16 +56,18 @@ def read_image(path: StrPath, remedy: str = REMEDY) -> Images:
         raise UsageError(path, *(misplaced(path, "an image") or ("is not an image", remedy))) from fault
 
 
+def as_numbers(name: str, values: ArrayLike) -> Float32s:
+    """Return what a caller gives as an array; raise HMAError if it is none of numbers."""
+    try:
+        return np.asarray(values, np.float32)
+    except (TypeError, ValueError) as fault:
+        raise HMAError("prompt", f"its {name} are no array of numbers", "give rows of one length") from fault
+
+
 def image_shape(config: HMAConfig) -> tuple[int, int, int]:
     """Return (S, V·S, 3) of a model's images."""
     size = TokenizerSpec.from_json(dict(config.tokenizer)).image_size
     return size, config.views * size, 3
-
-
-def trained_cameras(card: Mapping[str, Any]) -> Cameras:
-    """Return the cameras that a robot's stem was trained on, by its card."""
-    cameras = value_of(card.get("data"), "cameras")
-    return cameras if cameras and isinstance(cameras, str | list) else FIRST_CAMERA
 
 
 def seen_cameras(cameras: Cameras, stored: Sequence[str]) -> list[str]:

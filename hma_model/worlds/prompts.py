@@ -28,10 +28,10 @@ from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.arrays import Bools, Float32s, Ints
 from hma_model.checkpoint.folder import require_tokenizer
-from hma_model.generation.commands import card, described, yaml_of
-from hma_model.generation.decode import cameras_for
+from hma_model.generation.commands import described, yaml_of
+from hma_model.generation.decode import cameras_for, trained_cameras
 from hma_model.network.model import HMA
-from hma_model.worlds.images import Prompt, read_image, recorded_cameras, seen_cameras, trained_cameras
+from hma_model.worlds.images import Prompt, as_numbers, read_image, recorded_cameras, seen_cameras
 
 PROMPT_FORMS = (
     "give an image or images, an image's file, a folder of shards or of a LeRobotDataset, an environment "
@@ -128,10 +128,7 @@ def read_prompt(model: HMA, embodiment: str, prompt: Any = None, *, seed: int = 
         prompt = [folder]
     if isinstance(prompt, Sequence) and prompt and isinstance(prompt[0], str | PathLike):
         prompt = [read_image(path, PROMPT_FORMS) for path in prompt]
-    try:
-        images = np.atleast_1d(prompt)  # a number is no image, which `fitted` says
-    except ValueError as fault:
-        raise HMAError("prompt", "its images differ in size", "give images of one size") from fault
+    images = _array(prompt)
     return _of_frames(model, embodiment, images[None] if images.ndim in (2, 3) else images)
 
 
@@ -173,13 +170,24 @@ def _of_mapping(model: HMA, embodiment: str, prompt: Mapping[str, Any]) -> Promp
     given = dict(prompt)
     for key, read in (("shards", _of_shards), ("lerobot", _of_lerobot)):
         if key in given and not given.keys() - {key, *vars(EpisodePart())}:
-            return read(model, embodiment, given.pop(key), EpisodePart(**given))
+            folder = given.pop(key)
+            if not isinstance(folder, str | PathLike):
+                raise HMAError("prompt", f"{key} is {folder!r}, not a folder", PROMPT_FORMS)
+            return read(model, embodiment, folder, EpisodePart(**given))
     if "frames" not in given or given.keys() - {"frames", "chunks", "actions"}:
         raise HMAError("prompt", f"has the keys {', '.join(map(str, given))}", PROMPT_FORMS)
-    frames = np.atleast_1d(given["frames"])
+    frames = _array(given["frames"])
     if "actions" in given:
         return _strided(model, embodiment, frames, given["actions"])
     return _of_frames(model, embodiment, frames, given.get("chunks"))
+
+
+def _array(images: Any) -> NDArray[Any]:
+    """Return images as one array; that a number is no image, `fitted` says."""
+    try:
+        return np.atleast_1d(images)
+    except ValueError as fault:
+        raise HMAError("prompt", "its images differ in size", "give images of one size") from fault
 
 
 def _of_frames(model: HMA, embodiment: str, frames: NDArray[Any], chunks: ArrayLike | None = None) -> Prompt:
@@ -187,14 +195,14 @@ def _of_frames(model: HMA, embodiment: str, frames: NDArray[Any], chunks: ArrayL
         described(model, embodiment)  # raises if the model lacks it
         width = model.embodiments[embodiment].chunk_dim
         chunks = np.full((max(0, len(frames) - 1), width), np.nan)
-    return Prompt(frames, np.asarray(chunks, np.float32))
+    return Prompt(frames, as_numbers("chunks", chunks))
 
 
 def _strided(model: HMA, embodiment: str, frames: NDArray[Any], actions: ArrayLike) -> Prompt:
     """Return every stride-th frame, the last one included, and the chunks between them."""
     described(model, embodiment)
     space = model.embodiments[embodiment]
-    values = np.asarray(actions, np.float32)
+    values = as_numbers("actions", actions)
     if values.shape != (len(frames) - 1, space.action_dim):
         fault = f"has actions of the shape {values.shape} for {len(frames)} frames"
         raise HMAError("prompt", fault, f"give ({len(frames) - 1}, {space.action_dim})")
@@ -307,7 +315,7 @@ def _of_recording(model: HMA, robot: Embodiment, recording: Path, part: EpisodeP
             spec.image_size,
             spec.resize_filter,
         )
-        for name in seen_cameras(trained_cameras(card(model, robot.id)), recorded_cameras(robot))
+        for name in seen_cameras(trained_cameras(model, robot.id), recorded_cameras(robot))
     ]
     chunks = _chunks(clip.actions, clip.action_known, at, robot.stride)
     return Prompt(np.concatenate(views, axis=2), chunks)

@@ -39,7 +39,6 @@ from hma_model.worlds.images import (
     recorded_cameras,
     sample_image,
     seen_cameras,
-    trained_cameras,
 )
 
 if TYPE_CHECKING:
@@ -294,14 +293,14 @@ def drivable(
                 shards.folder, f"{checkpoint.name} does not know the robot {name}", f"known: {known}"
             )
         require_tokenizer(checkpoint.config, shards.spec, shards.folder)
-        cameras = trained_cameras(checkpoint.card(name))
+        cameras = checkpoint.cameras(name)
         robot = RecordedRobot(shards, tokenizer, checkpoint.stats(name), cameras)
         found[robot.key] = robot
     recorded = {robot.embodiment.id for robot in found.values()}
     for name in checkpoint.embodiments:
         embodiment = checkpoint.embodiment(name)
         stats = checkpoint.stats(name)
-        cameras = trained_cameras(checkpoint.card(name))
+        cameras = checkpoint.cameras(name)
         begun = list(images)
         if simulated(name):
             found[name] = LabRobot(embodiment, stats, image_shape(checkpoint.config)[0])

@@ -33,7 +33,7 @@ from hma_model.generation.rollout import Rollout
 from hma_model.generation.state import Snapshot as Snapshot
 from hma_model.generation.unmask import Decoding, check
 from hma_model.network.model import HMA
-from hma_model.worlds.images import fitted, image_shape
+from hma_model.worlds.images import as_numbers, fitted, image_shape
 
 
 @dataclass(frozen=True)
@@ -228,7 +228,13 @@ class World:
             images = fitted(frames, config, described(self.model, embodiment))
             views = [self.tokenizer.encode(view) for view in np.split(images, config.views, axis=2)]
             frames = np.concatenate(views, axis=-2)
-        return frames.astype(np.int64 if config.kind == "discrete" else np.float32)
+        if config.kind != "discrete":
+            return frames.astype(np.float32)
+        ids = frames.astype(np.int64)
+        if not 0 <= ids.min() <= ids.max() < config.vocab_size:
+            fault = f"has tokens from {ids.min()} to {ids.max()}"
+            raise HMAError("prompt", fault, f"give those of the tokenizer, from 0 to {config.vocab_size - 1}")
+        return ids
 
     def stored(self, session: int) -> NDArray[Any]:
         """Return the newest frame of a session as shards store it: tokens (h, w) or latents (c, h, w)."""
@@ -317,11 +323,12 @@ class World:
         stored = self.encoded(embodiment, np.asarray(frames)[-self.model.config.frames :])
         if chunks is None:
             chunks = np.full((len(frames) - 1, spec.stride * len(spec.names)), np.nan)
+        chunks = as_numbers("chunks", chunks)
         if len(chunks) != len(frames) - 1:
             fault = f"has {len(chunks)} chunks for {len(frames)} frames"
             raise HMAError("prompt", fault, f"give {len(frames) - 1}, one from each frame to the next")
         # A prompt longer than the model's window has lost its first frames, and the chunks between them.
-        read = [spec.read(chunk) for chunk in np.asarray(chunks)[len(frames) - len(stored) :]]
+        read = [spec.read(chunk) for chunk in chunks[len(frames) - len(stored) :]]
         known = torch.tensor([known for _, known in read], dtype=torch.bool)
         values = np.stack([chunk for chunk, _ in read]) if read else np.zeros((0, 1), np.float32)
         return torch.from_numpy(stored), torch.from_numpy(values), known

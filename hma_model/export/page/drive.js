@@ -269,9 +269,10 @@ function drawTruth(shapes) {
     [view.height, view.width] = manifest.image;
     return paint(view, canvas, shapes);
   }
-  const { strip, columns } = replays[start], side = strip.width / columns;
-  view.width = view.height = side;
-  view.getContext("2d").drawImage(strip, frame % columns * side, Math.floor(frame / columns) * side, side, side, 0, 0, side, side);
+  const { strip, columns, chunks } = replays[start];
+  view.width = strip.width / columns;
+  view.height = strip.height / Math.ceil((chunks.length + 1) / columns);
+  view.getContext("2d").drawImage(strip, -(frame % columns) * view.width, -Math.floor(frame / columns) * view.height);
 }
 
 async function replay() {

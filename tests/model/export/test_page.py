@@ -177,6 +177,8 @@ def test_a_replay_shows_the_true_images_until_a_person_drives(page: "Page", serv
     page.wait_for_function(f"document.body.dataset.frame === '{len(chunks)}'")
     assert np.allclose(np.float32([chunk for chunk, _ in page.evaluate("kept")]), chunks)
     assert page.is_visible("#true-figure") and page.is_hidden("#unknown")
+    shown = page.evaluate("(({ height, width }) => [height, width])(document.querySelector('#true-view'))")
+    assert shown[0] == 2 * shown[1] > 0
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
     page.keyboard.press("p")
     page.wait_for_selector("#unknown:visible")
@@ -189,7 +191,8 @@ def without_simulator(folder: Path) -> Any:
     manifest = json.loads((folder / "manifest.json").read_text())
     (robot,) = manifest["robots"]
     recorded = np.load(folder / robot["replays"]["chunks"])
-    images = np.zeros((recorded.shape[1] + 1, *manifest["image"]), np.uint8)
+    height, width, _ = manifest["image"]
+    images = np.zeros((recorded.shape[1] + 1, height, width // 2, 3), np.uint8)  # need not be squares
     starts = [Start(*[np.zeros(1)] * 4, replay, images) for replay in recorded]
     robot["replays"] = write_replays(folder / "robots" / ROBOT, starts)
     robot["simulator"] = None

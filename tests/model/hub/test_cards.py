@@ -10,7 +10,7 @@ import pytest
 import torch
 from huggingface_hub import DatasetCard, ModelCard
 
-from hma_data.errors import HMAError, HubError
+from hma_data.errors import CheckpointError, HMAError, HubError
 from hma_data.tokenizers.base import get_tokenizer
 from hma_data.tokenizers.shapes import get_spec, palette_spec
 from hma_model.checkpoint import io as checkpoint
@@ -24,7 +24,6 @@ from hma_model.hub.datasets import pull_data, push_data
 from hma_model.hub.listing import list_embodiments, survey
 from hma_model.network.model import HMA
 from hma_model.play.holding import holdings
-from hma_model.worlds.images import trained_cameras
 from recipes.bench import holds
 from tests.hostile import cut, values
 from tests.model.robots import edit_card, make_model, save
@@ -265,7 +264,14 @@ def test_a_broken_card_of_ones_own_stops_neither_push_nor_play(folder, tmp_path,
         values(data=data, evaluation=evaluation)(folder / "embodiments/arm/card.json")
         assert main(["hub", "push", str(folder), str(tmp_path / "hub")]) == 0
         opened = Checkpoint.open(folder)
-        assert holdings(opened)["arm"].follows is None and trained_cameras(opened.card("arm")) == "first"
+        assert holdings(opened)["arm"].follows is None and opened.cameras("arm") == "first"
+
+
+def test_a_card_that_names_more_cameras_than_the_model_has_views_is_refused(folder):
+    values(data={"cameras": ["top", "side"]})(folder / "embodiments/arm/card.json")
+    fault = "card.json: names 2 cameras, but a frame of the model has 1"
+    with pytest.raises(CheckpointError, match=fault):
+        Checkpoint.open(folder).cameras("arm")
 
 
 def test_stems_trained_apart_generate_together_what_each_generates_alone(folder, tmp_path):

@@ -457,7 +457,7 @@ def test_a_module_that_is_not_there_is_said_with_where_it_is_looked_for(world: W
 
 def test_a_module_or_policy_that_exits_is_an_error(world: World, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / "leaves.py").write_text("raise SystemExit(0)")
+    (tmp_path / "leaves.py").write_text("import sys\nsys.path[:] = sys.path[1:]\nraise SystemExit(0)")
     scenes = Scenes.of(world, ROBOT, 1, 0)
     with pytest.raises(HMAError, match="leaves:act: cannot be imported: SystemExit"):
         read_policy("leaves:act", scenes)

@@ -119,6 +119,13 @@ def test_the_estimate_of_a_pass_is_near_what_it_keeps_for_its_backward_pass(spec
     assert 0.5 < activation_bytes(model.config, recipe, 1, CPU) / sum(kept.values()) < 2
 
 
+@pytest.mark.parametrize(("spec", "changes"), [(TOKENS, SMALL), (COLORS, WHOLE)])
+def test_a_finetuning_with_shorter_windows_than_its_checkpoint_keeps_less(spec, changes):
+    recipe = make_recipe({"objectives": {"forward": 1}, **changes, "frames": 12})
+    config, shorter = recipe.network(spec), recipe.model_copy(update={"frames": 4})
+    assert activation_bytes(config, shorter, 1, CPU) < 0.5 * activation_bytes(config, recipe, 1, CPU)
+
+
 @pytest.mark.parametrize("objective", OBJECTIVES)
 @pytest.mark.parametrize(
     ("name", "spec"),

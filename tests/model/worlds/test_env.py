@@ -257,11 +257,17 @@ def test_an_action_that_is_refused_leaves_no_environment_of_a_vector_ahead(world
         ({"embodiment": None}, "embodiment: is not given — give embodiment=ID; the model has: pusht_fast"),
         ({"embodiment": "ur5"}, "ur5: is not in the model"),
         ({"control": "second"}, "'second' is unknown — give frame or chunk"),
+        ({"size": 0}, "size: is 0 — give 1 or more pixels"),
     ],
 )
 def test_bad_settings_are_refused(world: World, change: dict[str, Any], message: str) -> None:
     with pytest.raises(HMAError, match=message):
         WorldModelEnv(**{"embodiment": PUSH, "world": world, **change})
+
+
+def test_a_vector_of_no_environments_is_refused(world: World) -> None:
+    with pytest.raises(HMAError, match="num_envs: is 0 — give 1 or more"):
+        WorldModelVectorEnv(0, embodiment=PUSH, world=world)
 
 
 def test_a_gray_image_is_refused_with_its_shape(world: World) -> None:

@@ -136,6 +136,10 @@ def test_cameras_recorded_elsewhere_are_paired_by_name_and_the_primary_one_stays
         ("README.md", "README.md: is not an image — give an image or images"),
         ("no/such.png", "cannot be read: No such file or directory — give an image"),
         ({"frames": np.zeros((3, 8, 8, 3), np.uint8), "actions": np.zeros((3, 2))}, r"give \(2, 2\)"),
+        ({"frames": np.zeros((3, 8, 8, 3), np.uint8), "actions": [[1, 2], [1]]}, "its actions are no array"),
+        ({"frames": np.zeros((3, 8, 8, 3), np.uint8), "chunks": "abc"}, "its chunks are no array of numbers"),
+        ({"frames": [[1, 2], [1]]}, "its images differ in size"),
+        ({"shards": 5}, "shards is 5, not a folder — give an image or images"),
     ],
 )
 def test_prompts_that_cannot_be_read_are_refused(model: HMA, prompt: Any, message: str) -> None:

@@ -166,11 +166,19 @@ def test_actions_that_do_not_fit_are_refused(model, windows, actions, message) -
         (np.zeros((0, 8, 8, 3), np.uint8), None, "frames are uint8"),
         (np.zeros((3, 8, 8, 3), np.uint8), np.zeros((1, 10)), "has 1 chunks for 3 frames — give 2"),
         (np.zeros((2, 8, 8, 3), np.uint8), np.zeros((1, 6)), r"have the shape \(6,\)"),
+        (np.zeros((3, 8, 8, 3), np.uint8), [[0, 0], [0]], "its chunks are no array of numbers"),
     ],
 )
 def test_prompts_that_do_not_fit_are_refused(model: HMA, frames: Any, chunks: Any, message: str) -> None:
     with pytest.raises(HMAError, match=message):
         make(model).open(OTHER, frames, chunks)
+
+
+def test_tokens_that_the_tokenizer_does_not_have_are_refused(model: HMA) -> None:
+    for token in (-1, model.config.vocab_size):
+        frames = np.full((2, *model.config.frame_shape), token)
+        with pytest.raises(HMAError, match=f"tokens from {token} to {token} — give those of the tokenizer"):
+            make(model).open(OTHER, frames)
 
 
 def test_what_is_not_there_is_said(model: HMA, windows: dict[str, Any]) -> None:
