@@ -23,6 +23,7 @@ from hma_data.errors import RecipeError, TokenizerError
 
 if TYPE_CHECKING:
     from hma_data.registry.embodiment import Embodiment
+    from hma_data.tokenizers.base import TokenizerSpec
 
 CROP_EDGE = 2  # tokens from the cut edge of a square that have no loss, as they lack what lies beyond it
 MOST_IDS = 2**62  # of the trunk's tokens: ids are int64
@@ -205,6 +206,13 @@ class HMAConfig:
     def released(self) -> bool:
         """Return whether the layout is that of the paper's released weights."""
         return self.layout == "released"
+
+    @property
+    def spec(self) -> "TokenizerSpec":
+        """Return the spec of the tokenizer."""
+        from hma_data.tokenizers.base import TokenizerSpec
+
+        return TokenizerSpec.from_json(dict(self.tokenizer))
 
     @property
     def token_grid(self) -> tuple[int, int]:

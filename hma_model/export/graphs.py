@@ -50,7 +50,7 @@ class Port:
 
 def require_exportable(model: Network, tokenizer: Tokenizer) -> None:
     """Raise CheckpointError for a model or tokenizer whose graphs are not written."""
-    config, where = model.config, model.source.name if model.source else "the model"
+    config, where = model.config, model.name
     if not config.predicts_video:
         raise CheckpointError(where, "was not trained to predict frames", "export another checkpoint")
     if config.released or config.absent_action != "embedding":

@@ -207,8 +207,7 @@ class Rollout:
         """
         if not self.config.predicts_video:
             fault = f"was not trained to predict frames, but for {', '.join(self.config.objectives)}"
-            where = self.model.source.name if self.model.source else "the model"
-            raise HMAError(where, fault, "choose another checkpoint")
+            raise HMAError(self.model.name, fault, "choose another checkpoint")
         chosen = self._begun(rows)
         self._make_room(chosen)
         self._take(chosen, chunk, following, known)

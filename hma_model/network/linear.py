@@ -42,7 +42,7 @@ class Linear(nn.Linear):
     def forward(self, x: Tensor) -> Tensor:
         """Map (..., I) to (..., O)."""
         if _suits_onednn(self, x):
-            made: Tensor = _Product.apply(x, self.weight, self.bias)
+            made: Tensor = _Product.apply(x, self.weight, self.bias, False)
             return made
         return super().forward(x)
 
@@ -58,7 +58,7 @@ def after_norm(norm: nn.Module, linear: nn.Module, x: Tensor) -> Tensor:
 def after_gelu(linear: nn.Module, x: Tensor) -> Tensor:
     """Apply a GELU and a linear map to (..., I); the backward pass recomputes the GELU."""
     if _suits_onednn(linear, x):
-        made: Tensor = _GeluProduct.apply(x, linear.weight, linear.bias)
+        made: Tensor = _Product.apply(x, linear.weight, linear.bias, True)
         return made
     return recomputed(linear, lambda x: linear(F.gelu(x)), x)
 
@@ -111,11 +111,13 @@ def _weight_grads(grad: Tensor, x: Tensor, weight: Tensor, biased: bool) -> tupl
 
 
 class _Product(torch.autograd.Function):
+    """A product, and with `gelu` the GELU before it, which the backward pass computes again."""
+
     @staticmethod
-    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor | None, gelu: bool) -> Tensor:
         ctx.save_for_backward(x, weight)
-        ctx.biased = bias is not None
-        return _product(x, weight, bias)
+        ctx.biased, ctx.gelu = bias is not None, gelu
+        return _product(F.gelu(x) if gelu else x, weight, bias)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -123,27 +125,11 @@ class _Product(torch.autograd.Function):
         x, weight = ctx.saved_tensors
         grad = grad.contiguous()
         of_x = _product(grad, weight.t()) if ctx.needs_input_grad[0] else None
+        if ctx.gelu and of_x is not None:
+            of_x = _ATEN.gelu_backward(of_x, x)
         if not ctx.needs_input_grad[1]:
-            return of_x, None, None
-        return of_x, *_weight_grads(grad, x, weight, ctx.biased)
-
-
-class _GeluProduct(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
-        ctx.save_for_backward(x, weight)
-        ctx.biased = bias is not None
-        return _product(F.gelu(x), weight, bias)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> Any:
-        x, weight = ctx.saved_tensors
-        grad = grad.contiguous()
-        of_x = _ATEN.gelu_backward(_product(grad, weight.t()), x) if ctx.needs_input_grad[0] else None
-        if not ctx.needs_input_grad[1]:
-            return of_x, None, None
-        return of_x, *_weight_grads(grad, F.gelu(x), weight, ctx.biased)
+            return of_x, None, None, None
+        return of_x, *_weight_grads(grad, F.gelu(x) if ctx.gelu else x, weight, ctx.biased), None
 
 
 class _NormProduct(torch.autograd.Function):

@@ -23,7 +23,7 @@ from hma_model.network.copying import frames_before
 from hma_model.network.network import Network
 from hma_model.network.objectives import Output, compute
 from hma_model.network.stem import patches_before, patchify, to_digits
-from hma_model.network.trunks.contract import Conditioning, TimePositions
+from hma_model.network.trunks.contract import TimePositions
 
 if TYPE_CHECKING:
     from hma_data.loading.rows import Batch
@@ -98,14 +98,12 @@ class HMA(Network):
         """
         self._require("discrete", "video_logits")
         groups, times = Groups.of(embodiment, len(tokens)), self.time_positions(tokens.shape[1])
-        conditioning = self._condition_window(actions, action_mask, groups, times)
         values = groups.sort(self.frame_values(tokens))
-        x = self.embed(values)
         given = None if true is None else to_digits(groups.sort(self.frame_values(true)), self.config.digits)
         before = None
         if self.config.copy_previous:
             before = frames_before(values, list(range(-1, values.shape[1] - 1)), self.config)
-        features = self.video_features(self.trunk(x, conditioning, times))
+        features = self._video_features(self.embed(values), actions, action_mask, groups, times)
         scores = self.token_readout(features, given, before)
         return groups.unsort(self.token_readout.split(scores)).unflatten(2, self.config.token_grid)
 
@@ -129,16 +127,15 @@ class HMA(Network):
         """
         self._require("continuous", "video_conditions")
         groups, times = Groups.of(embodiment, len(latents)), self.time_positions(latents.shape[1])
-        conditioning = self._condition_window(actions, action_mask, groups, times)
-        patches, pixels = patchify(latents, self.config.patch), patchify(mask.unsqueeze(2), self.config.patch)
-        x = self.embed(groups.sort(patches), groups.sort(pixels))
+        patches, pixels = (
+            groups.sort(patchify(values, self.config.patch)) for values in (latents, mask.unsqueeze(2))
+        )
         before = None
         if self.config.copy_previous:
-            order = range(-1, patches.shape[1] - 1)
-            before = patches_before(groups.sort(patches), groups.sort(pixels), order, self.config.patch)
-        conditions = self.latent_readout(
-            self.video_features(self.trunk(x, conditioning, times)), times.positions, before
-        )
+            before = patches_before(patches, pixels, range(-1, patches.shape[1] - 1), self.config.patch)
+        x = self.embed(patches, pixels)
+        features = self._video_features(x, actions, action_mask, groups, times)
+        conditions = self.latent_readout(features, times.positions, before)
         return groups.unsort(conditions).unflatten(2, self.config.token_grid)
 
     @torch.no_grad()
@@ -248,12 +245,13 @@ class HMA(Network):
             warn_outside(self, actions[:, :used], embodiment, None if known is None else known[:, :used])
         return torch.stack(made, dim=1)
 
-    def _condition_window(
-        self, actions: Tensor | None, known: Tensor | None, groups: Groups, times: TimePositions
-    ) -> Conditioning:
-        """Return the trunk's conditioning by chunks (B, T, K), of which some are known (B, T)."""
+    def _video_features(
+        self, x: Tensor, actions: Tensor | None, known: Tensor | None, groups: Groups, times: TimePositions
+    ) -> Tensor:
+        """Return the features of embedded frames and chunks (B, T, K), of which some are known (B, T)."""
         given = None if actions is None else align(self.config, actions, known, len(times.positions))
-        return self.condition(given, groups, times.positions)
+        conditioning = self.condition(given, groups, times.positions)
+        return self.video_features(self.trunk(x, conditioning, times))
 
     def _require(self, kind: str, name: str) -> None:
         if self.config.kind != kind:

@@ -59,6 +59,11 @@ class Network(nn.Module):
         self.heads = nn.ModuleDict()
 
     @property
+    def name(self) -> str:
+        """Return the checkpoint that the model was loaded from, as an error names it."""
+        return self.source.name if self.source else "the model"
+
+    @property
     def device(self) -> torch.device:
         """Return the device of the trunk."""
         return self.trunk.absent.device
@@ -239,11 +244,10 @@ class Network(nn.Module):
         """Raise HMAError unless an objective of the training trained a readout: else it returns noise."""
         if readout in self.config.trained_readouts:
             return
-        where = where or (self.source.name if self.source else "the model")
         objectives = ", ".join(name for name, weight in self.config.objectives.items() if weight)
         wanted = [f"{{{name}: 1.0}}" for name, one in OBJECTIVES.items() if one.readout == readout]
         fault = f"was not trained to {readout.deed}, but for {objectives}"
-        raise HMAError(where, fault, f"train one with objectives={' or '.join(wanted)}")
+        raise HMAError(where or self.name, fault, f"train one with objectives={' or '.join(wanted)}")
 
     def read_chunks(self, pooled: Tensor, groups: Groups, readout: Readout, generator: Generators) -> Tensor:
         """Read chunks (B, T, K) in the batch's order off action features (B, T, D) sorted by embodiment.

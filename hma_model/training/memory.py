@@ -144,8 +144,7 @@ def require_memory(model: Network, recipe: Recipe, device: torch.device, ranks: 
     needed, there = needed_bytes(model, recipe, device, ranks), free_bytes(device)
     if needed <= there:
         return
-    keys = _fitting_keys(model, recipe, device, ranks, recipe.batch_size)
-    remedy = f"set {keys}" if keys else f"use a smaller network, as in {SMALLER}"
+    remedy = _remedy(model, recipe, device, ranks, recipe.batch_size)
     weights = sum(parameter.numel() for parameter in model.parameters())
     what = f"{weights / 1e6:,.0f} million weights and {share(recipe, ranks)[1]} windows per pass"
     fault = f"needs about {needed / GIB:,.1f} GiB ({what}), and {there / GIB:,.1f} GiB are free"
@@ -165,14 +164,13 @@ def memory_errors(model: Network, recipe: Recipe, device: torch.device, ranks: i
         text = str(fault).partition("\n")[0][:200]
         if isinstance(fault, RuntimeError) and not _NO_MEMORY.search(text):
             raise
-        keys = _fitting_keys(model, recipe, device, ranks, recipe.batch_size // 2)
-        remedy = f"set {keys}, which should fit" if keys else f"use a smaller network, as in {SMALLER}"
+        remedy = _remedy(model, recipe, device, ranks, recipe.batch_size // 2)
         told = ": ".join(filter(None, ("too little for this model and batch", text)))
         raise TrainingError("memory", told, remedy) from fault
 
 
-def _fitting_keys(model: Network, recipe: Recipe, device: torch.device, ranks: int, most: int) -> str:
-    """Return the keys of the largest passes, of `most` windows or fewer, that should fit; empty for none."""
+def _remedy(model: Network, recipe: Recipe, device: torch.device, ranks: int, most: int) -> str:
+    """Return what to do: set the keys of the largest passes, of `most` windows or fewer, that should fit."""
     there = free_bytes(device)
     sizes = [most >> halvings for halvings in range(most.bit_length())]
     for checkpointing, size in product(dict.fromkeys((recipe.checkpointing, True)), sizes):
@@ -182,5 +180,5 @@ def _fitting_keys(model: Network, recipe: Recipe, device: torch.device, ranks: i
         even = size * keys["accumulate"] % ranks == 0
         smaller = recipe.model_copy(update=keys)
         if even and needed_bytes(model, smaller, device, ranks, passes=True) <= there:
-            return " ".join(f"{key}={str(value).lower()}" for key, value in keys.items())
-    return ""
+            return "set " + " ".join(f"{key}={str(value).lower()}" for key, value in keys.items())
+    return f"use a smaller network, as in {SMALLER}"

@@ -22,7 +22,6 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import read_json
 from hma_data.storage.paths import addressed, is_repository
-from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.checkpoint import io as checkpoints
 from hma_model.checkpoint import weights as stored
 from hma_model.checkpoint.folder import README, Checkpoint, require_tokenizer, resolve
@@ -114,9 +113,9 @@ class Start:
                 fault = f"is {value!r}, the checkpoint that the run starts from has {getattr(config, key)!r}"
                 remedy = "leave it out: the network is the checkpoint's"
                 raise RecipeError(f"recipe: model.{key}", fault, remedy)
-        spec = TokenizerSpec.from_json(dict(config.tokenizer)) if recipe.digits and config.tokenizer else None
-        if spec and config.factored and recipe.factored(spec) != tuple(config.factored):
-            fault = f"gives digits of {recipe.factored(spec)}, the checkpoint has {tuple(config.factored)}"
+        digits = recipe.factored(config.spec) if recipe.digits and config.tokenizer else ()
+        if digits and config.factored and digits != config.factored:
+            fault = f"gives digits of {digits}, the checkpoint has {config.factored}"
             raise RecipeError("recipe: digits", fault, "leave it out: the network is the checkpoint's")
         if (views := view_count(recipe.cameras)) != config.views:
             fault = f"are {views} in a frame, the checkpoint that the run starts from has {config.views}"

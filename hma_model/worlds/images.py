@@ -16,7 +16,6 @@ from hma_data.loading.views import Cameras
 from hma_data.registry.embodiment import Embodiment
 from hma_data.storage.kinds import misplaced
 from hma_data.storage.paths import StrPath, as_path
-from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.arrays import Float32s, Images
 from hma_model.checkpoint.folder import SAMPLE, Checkpoint
 from hma_model.config import HMAConfig
@@ -66,7 +65,7 @@ def as_numbers(name: str, values: ArrayLike) -> Float32s:
 
 def image_shape(config: HMAConfig) -> tuple[int, int, int]:
     """Return (S, V·S, 3) of a model's images."""
-    size = TokenizerSpec.from_json(dict(config.tokenizer)).image_size
+    size = config.spec.image_size
     return size, config.views * size, 3
 
 
@@ -102,7 +101,7 @@ def fitted(images: NDArray[Any], config: HMAConfig, robot: Embodiment | None) ->
     if images.ndim != 4 or images.shape[-1] != 3 or images.dtype != np.uint8 or not len(images):
         fault = f"frames are {images.dtype} of the shape {images.shape}"
         raise HMAError("prompt", fault, "give images (P, H, W, 3) uint8, or stored tokens")
-    spec = TokenizerSpec.from_json(dict(config.tokenizer))
+    spec = config.spec
     shape = image_shape(config)
     if images.shape[1:] == shape:
         return images

@@ -25,7 +25,6 @@ from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.windows import episode_pieces, pieces
 from hma_data.sources.base import open_source
 from hma_data.storage.paths import StrPath, as_path
-from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.arrays import Bools, Float32s, Ints
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.generation.commands import described, yaml_of
@@ -306,7 +305,7 @@ def _of_recording(model: HMA, robot: Embodiment, recording: Path, part: EpisodeP
     ids = source.episode_ids(recording)
     clip = to_clip(source.read(recording, ids[part.number(ids, recording)], robot), robot)
     at = part.rows(model, pieces(pauses(clip.timestamps), len(clip), robot.stride), robot.stride)
-    spec = TokenizerSpec.from_json(dict(model.config.tokenizer))
+    spec = model.config.spec
     views = [
         prepared(
             clip.episode.streams[name],

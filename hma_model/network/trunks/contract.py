@@ -15,9 +15,11 @@ from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from hma_model.config import HMAConfig
 from hma_model.network.rotary import rotary_angles
+from hma_model.network.stem import LatentEmbedding, NoiseEmbedding, TokenEmbedding
 
 
 @dataclass
@@ -162,6 +164,31 @@ class Trunk(Protocol):
 
     def carry(self, rows: int, slots: int, tokens: int, dtype: torch.dtype, device: torch.device) -> Carried:
         """Return what a rollout of so many rows carries, without any frame yet."""
+
+
+class BlockTrunk(nn.Module):
+    """What trunks of blocks have in common: the embedding of frames, and blocks that may be recomputed."""
+
+    def __init__(self, config: HMAConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.checkpointing = False
+        self.embed = TokenEmbedding(config) if config.kind == "discrete" else LatentEmbedding(config)
+        self.noise = NoiseEmbedding(config) if config.told_noise else None
+
+    def embed_frames(
+        self, frames: Tensor, masked: Tensor | None, previous: Sequence[int], corruption: Tensor | None
+    ) -> Tensor:
+        """Embed frames, as `Trunk.embed_frames` says."""
+        x: Tensor = self.embed(frames, masked, previous)
+        return x if corruption is None or self.noise is None else x + self.noise(corruption)
+
+    def run_block(self, block: nn.Module, *given: Any) -> Tensor:
+        """Call a block; with `checkpointing`, training recomputes it in the backward pass."""
+        if self.checkpointing and self.training and torch.is_grad_enabled():
+            made: Tensor = checkpoint(block, *given, use_reentrant=False)
+            return made
+        return block(*given)
 
 
 def rows_at(table: Tensor, positions: Tensor) -> Tensor:

@@ -14,13 +14,12 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
 from hma_model.config import HMAConfig
 from hma_model.network.linear import Linear, after_gelu, after_norm, recomputed
 from hma_model.network.rotary import rotate, rotate_qkv, turns_of
-from hma_model.network.stem import LatentEmbedding, Modulation, NoiseEmbedding, TokenEmbedding
-from hma_model.network.trunks.contract import Carried, Conditioning, TimePositions, rows_at
+from hma_model.network.stem import Modulation
+from hma_model.network.trunks.contract import BlockTrunk, Carried, Conditioning, TimePositions, rows_at
 
 SEQUENCE_LIMIT = 2**15  # of one call of attention: kernels of a GPU refuse 65,536 and more
 # Keys up to which attention in bfloat16 on a CPU is computed as products of all sequences at once: the fused
@@ -339,22 +338,18 @@ class Block(nn.Module):
         return joined if conditioning.order is None else joined[conditioning.order[1]]
 
 
-class Transformer(nn.Module):
+class Transformer(BlockTrunk):
     """The space-time transformer: embedding, positions and blocks; it satisfies `contract.Trunk`."""
 
     def __init__(self, config: HMAConfig) -> None:
-        super().__init__()
-        self.config = config
-        self.checkpointing = False
-        continuous = config.kind == "continuous"
+        super().__init__(config)
         positions = config.frames if config.released else 1
         tokens = config.tokens_per_frame + max(config.appended_tokens, config.absent_tokens)
-        self.embed = LatentEmbedding(config) if continuous else TokenEmbedding(config)
-        self.noise = NoiseEmbedding(config) if config.told_noise else None
         self.position = nn.Parameter(torch.randn(positions, tokens, config.width) * 0.02)
         if config.position_init == "sinusoid":
             with torch.no_grad():
                 self.position[:, : config.tokens_per_frame] = sinusoids(config.token_grid, config.width)
+        continuous = config.kind == "continuous"
         self.embed_norm = nn.LayerNorm(config.width, eps=1e-6) if continuous else nn.Identity()
         self.absent = nn.Parameter(torch.randn(positions, config.width) * 0.02)
         self.modulation: Modulation | None = None
@@ -370,13 +365,6 @@ class Transformer(nn.Module):
                 nn.init.normal_(module.weight, std=std)
                 if module.bias is not None:
                     nn.init.zeros_(module.bias)
-
-    def embed_frames(
-        self, frames: Tensor, masked: Tensor | None, previous: Sequence[int], corruption: Tensor | None
-    ) -> Tensor:
-        """Embed frames, as `Trunk.embed_frames` says."""
-        x: Tensor = self.embed(frames, masked, previous)
-        return x if corruption is None or self.noise is None else x + self.noise(corruption)
 
     def carry(self, rows: int, slots: int, tokens: int, dtype: torch.dtype, device: torch.device) -> Carried:
         """Return the cached keys and values of each layer.
@@ -405,8 +393,5 @@ class Transformer(nn.Module):
             cache = (None, None) if carried is None else carried.memory[layer * each : (layer + 1) * each]
             # After the last layer's keys and values, nothing reads the frames before `wanted`.
             first = times.wanted if layer == config.layers - 1 else 0
-            if self.checkpointing and self.training and torch.is_grad_enabled():
-                x = checkpoint(block, x, conditioning, layer, times, cache, first, use_reentrant=False)
-            else:
-                x = block(x, conditioning, layer, times, cache, first)
+            x = self.run_block(block, x, conditioning, layer, times, cache, first)
         return F.pad(self.norm(x), (0, 0, 0, 0, times.wanted, 0)) if times.wanted else self.norm(x)

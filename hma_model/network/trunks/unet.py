@@ -10,17 +10,14 @@ R slots of a row, E width of the conditioning.
 """
 
 import math
-from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
 from hma_model.config import HMAConfig
-from hma_model.network.stem import LatentEmbedding, NoiseEmbedding, TokenEmbedding
-from hma_model.network.trunks.contract import Carried, Conditioning, TimePositions
+from hma_model.network.trunks.contract import BlockTrunk, Carried, Conditioning, TimePositions
 
 CONDITIONING = 192  # E
 
@@ -82,17 +79,13 @@ class Ages(nn.Module):
         return x
 
 
-class UNet(nn.Module):
+class UNet(BlockTrunk):
     """The U-Net: embedding, ages, blocks down and up; it satisfies `contract.Trunk`."""
 
     def __init__(self, config: HMAConfig) -> None:
-        super().__init__()
-        self.config = config
-        self.checkpointing = False
+        super().__init__(config)
         self.modulation = None  # the blocks have their own
         width, ages, views = config.width, config.frames, config.views
-        self.embed = TokenEmbedding(config) if config.kind == "discrete" else LatentEmbedding(config)
-        self.noise = NoiseEmbedding(config) if config.told_noise else None
         self.absent = nn.Parameter(torch.randn(1, width) * 0.02)
         self.unseen = nn.Parameter(torch.zeros(ages, width))  # added where an age repeats the oldest frame
         levels = config.levels
@@ -114,13 +107,6 @@ class UNet(nn.Module):
         self.grow = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in pairs)
         self.norm = nn.LayerNorm(levels[0])
         self.output = nn.Conv2d(levels[0], views * width, 3, padding=1)
-
-    def embed_frames(
-        self, frames: Tensor, masked: Tensor | None, previous: Sequence[int], corruption: Tensor | None
-    ) -> Tensor:
-        """Embed frames, as `Trunk.embed_frames` says."""
-        x: Tensor = self.embed(frames, masked, previous)
-        return x if corruption is None or self.noise is None else x + self.noise(corruption)
 
     def carry(self, rows: int, slots: int, tokens: int, dtype: torch.dtype, device: torch.device) -> Carried:
         """Return the embeddings of past frames (R, rows, S, D) and of their actions (R, rows, D)."""
@@ -204,7 +190,7 @@ class UNet(nn.Module):
         layers, kept = self.config.layers, []
         for level in range(self.depth + 1):
             for block in self.blocks[level * layers : (level + 1) * layers]:
-                x = self._run(block, x, condition)
+                x = self.run_block(block, x, condition)
             if level < self.depth:
                 kept.append(x)
                 x = convolve(self.shrink[level], x)
@@ -213,11 +199,6 @@ class UNet(nn.Module):
             x = convolve(self.grow[level], x).repeat_interleave(2, 1).repeat_interleave(2, 2)
             x = torch.cat([x, kept[level]], dim=-1)
             for block in self.blocks[first + level * layers : first + (level + 1) * layers]:
-                x = self._run(block, x, condition)
+                x = self.run_block(block, x, condition)
         x = convolve(self.output, F.silu(self.norm(x)))
         return x.unflatten(-1, (self.config.views, -1)).permute(0, 3, 1, 2, 4).flatten(1, 3)
-
-    def _run(self, block: nn.Module, x: Tensor, condition: Tensor) -> Tensor:
-        if self.checkpointing and self.training and torch.is_grad_enabled():
-            return checkpoint(block, x, condition, use_reentrant=False)
-        return block(x, condition)
