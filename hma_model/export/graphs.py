@@ -257,16 +257,14 @@ class StepGraph(nn.Module):
 
     def _digits(self, frame: Tensor) -> Tensor:
         """Return the digits (1, S, F) of tokens (h, w), those of a square of tokens side by side."""
-        config = self.config
-        squares = frame.unflatten(1, (-1, config.merge)).unflatten(0, (-1, config.merge)).transpose(1, 2)
-        return to_digits(squares.reshape(1, config.tokens_per_frame, -1), config.factored).flatten(2)
+        squares = patchify(frame[None, None], self.config.merge)
+        return to_digits(squares, self.config.factored).flatten(2)
 
     def _stored(self, digits: Tensor) -> Tensor:
         """Return the tokens (h, w) int32 of digits (1, S, F)."""
         config = self.config
         ids = from_digits(digits.unflatten(-1, (-1, len(config.factored))), config.factored)
-        squares = ids.view(*config.token_grid, config.merge, config.merge)
-        return squares.transpose(1, 2).flatten(2).flatten(0, 1).int()
+        return unpatchify(ids[0], config.merge, config.token_grid)[0].int()
 
     # -- patches of latents
 
@@ -275,7 +273,7 @@ class StepGraph(nn.Module):
     ) -> Tensor:
         """Return the next frame's latents (c, H, W) as stored."""
         config = self.config
-        before = patchify(frame[None, None] * config.latent_scale, config.patch)[0]
+        before = patchify(frame.unsqueeze(0) * config.latent_scale, config.patch)
         patches = torch.zeros_like(before)
 
         def embed(masked: Tensor) -> Tensor:
@@ -288,8 +286,7 @@ class StepGraph(nn.Module):
             noise = draws["noise"][own] if "noise" in draws else None
             made = self.readout.sample(_at(conditions, places)[0], None, 0.0, noise).unsqueeze(0)
             patches = _put(patches, places, made)
-        latents = unpatchify(patches.unsqueeze(0), config.patch, config.token_grid)[0, 0]
-        latents = latents / config.latent_scale
+        latents = unpatchify(patches[0], config.patch, config.token_grid) / config.latent_scale
         return latents.round() if config.pixels else latents
 
     # -- images

@@ -126,9 +126,7 @@ class Passes:
     def _known_features(self, rows: list[int], times: TimePositions, carried: Carried | None) -> Tensor:
         """Return the features (n, T, N, D) of known frames at times that all rows share, or (n, T) ones."""
         positions = times.positions if times.positions.dim() > 1 else times.positions.unsqueeze(0)
-        past = self.state.past(rows, positions)
-        masked = torch.zeros(past.shape[:3], dtype=torch.bool, device=past.device)
-        x = self.model.embed(past, masked.unsqueeze(-1))
+        x = self.model.embed(self.state.past(rows, positions))
         return self.engine.trunk(x, self._condition(rows, positions), times, carried)
 
     def _compute(self, frame: TokenFrame | PatchFrame, part: Pass, first: bool) -> tuple[Tensor, Tensor]:

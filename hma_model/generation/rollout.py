@@ -28,7 +28,7 @@ from hma_model.generation.engine import Engine
 from hma_model.generation.passes import Passes
 from hma_model.generation.state import RowState, Snapshot
 from hma_model.generation.unmask import Decoding, PatchFrame, TokenFrame, masked_after
-from hma_model.network.conditioning import ActionConditioning, Groups
+from hma_model.network.conditioning import ActionConditioning, Groups, unknown
 from hma_model.network.copying import known_digits
 from hma_model.network.network import Network
 from hma_model.network.stem import split_tokens, unpatchify
@@ -350,8 +350,7 @@ class Rollout:
         config = self.config
         if config.kind == "discrete":
             return split_tokens(values, config.merge, config.vocab_size, config.token_grid)
-        latents = unpatchify(values.unsqueeze(1), config.patch, config.token_grid)
-        shown = latents.squeeze(1) / config.latent_scale
+        shown = unpatchify(values, config.patch, config.token_grid) / config.latent_scale
         return shown.round() if config.pixels else shown  # the scale is not exact in float32
 
 
@@ -375,8 +374,7 @@ def _prompt_chunks(
         HMAError: the shapes are others.
     """
     batch, width, device = len(names), model.widest_chunk(names), model.device
-    chunks = torch.zeros(batch, frames, width, device=device)
-    given = ActionConditioning(chunks, torch.zeros(batch, frames, dtype=torch.bool, device=device))
+    given = unknown(batch, frames, width, device)
     if actions is None or frames == 1:
         return given
     if actions.shape[0] != batch or actions.shape[1] < frames - 1 or actions.shape[2] < width:

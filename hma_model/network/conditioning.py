@@ -104,12 +104,10 @@ def align(config: HMAConfig, actions: Tensor, known: Tensor | None, frames: int)
     return ActionConditioning(shifted, F.pad(known[:, : frames - 1], (1, 0)))
 
 
-def unknown(find_stem: FindStem, groups: Groups, frames: int) -> ActionConditioning:
-    """Return chunks (B, T, K) of zeros, as wide as the widest embodiment's, none of them known."""
-    inputs = [find_stem(name).input for name, _ in groups.parts]
-    width, device = max(linear.in_features for linear in inputs), inputs[0].weight.device
-    known = torch.zeros((groups.batch, frames), dtype=torch.bool, device=device)
-    return ActionConditioning(torch.zeros(groups.batch, frames, width, device=device), known)
+def unknown(batch: int, frames: int, width: int, device: torch.device) -> ActionConditioning:
+    """Return chunks (B, T, K) of zeros, none of them known."""
+    known = torch.zeros(batch, frames, dtype=torch.bool, device=device)
+    return ActionConditioning(torch.zeros(batch, frames, width, device=device), known)
 
 
 def condition(
@@ -137,7 +135,8 @@ def condition(
             return Conditioning()
         if config.absent_action == "tokens":
             return Conditioning(tokens=absent if unsort else groups.sort(absent))
-        given = unknown(find_stem, groups, frames)
+        widest = max(find_stem(name).input.in_features for name, _ in groups.parts)
+        given = unknown(groups.batch, frames, widest, absent.device)
     if positions.dim() > 1:
         absent = groups.sort(absent)
     chunks, known = groups.sort(given.chunks), groups.sort(given.known).unsqueeze(-1)

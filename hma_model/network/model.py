@@ -175,7 +175,8 @@ class HMA(Network):
         if actions is not None:
             given = align(self.config, actions, action_mask, count)
         elif self.config.absent_action != "tokens":
-            given = unknown(self.stem, groups, count)
+            width = self.widest_chunk([name for name, _ in groups.parts])
+            given = unknown(groups.batch, count, width, self.device)
         conditioning = self.condition(given, groups, times.positions)
         x = self.embed(groups.sort(self.frame_values(frames)))
         pooled = self.action_features(self.trunk(x, conditioning, times))

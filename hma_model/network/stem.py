@@ -50,9 +50,7 @@ def merge_tokens(tokens: Tensor, side: int, vocab_size: int) -> Tensor:
     """
     if side == 1:
         return tokens.flatten(2)
-    b, t, height, width = tokens.shape
-    split = tokens.reshape(b, t, height // side, side, width // side, side).transpose(3, 4)
-    parts = split.reshape(b, t, -1, side * side)
+    parts = patchify(tokens.unsqueeze(2), side)
     masked = (parts == vocab_size).any(-1)
     whole = from_digits(parts.masked_fill(masked.unsqueeze(-1), 0), (vocab_size,) * side**2)
     return whole.masked_fill(masked, vocab_size ** (side * side))
@@ -62,22 +60,19 @@ def split_tokens(tokens: Tensor, side: int, vocab_size: int, grid: tuple[int, in
     """Convert ids (..., S) of squares to ids (..., h, w) of their tokens; `grid` is (h/side, w/side)."""
     if side == 1:
         return tokens.unflatten(-1, grid)
-    parts = to_digits(tokens, (vocab_size,) * side**2).unflatten(-1, (side, side)).unflatten(-3, grid)
-    return parts.transpose(-3, -2).flatten(-4, -3).flatten(-2)
+    return unpatchify(to_digits(tokens, (vocab_size,) * side**2), side, grid).squeeze(-3)
 
 
 def patchify(latents: Tensor, patch: int) -> Tensor:
-    """Convert latents (B, T, c, H, W) to patches (B, T, S, c*p*p)."""
-    b, t, c, height, width = latents.shape
-    split = latents.reshape(b, t, c, height // patch, patch, width // patch, patch)
-    return split.permute(0, 1, 3, 5, 2, 4, 6).reshape(b, t, -1, c * patch * patch)
+    """Convert latents (..., c, H, W) to patches (..., S, c*p*p)."""
+    split = latents.unflatten(-1, (-1, patch)).unflatten(-3, (-1, patch)).transpose(-3, -2)
+    return split.movedim(-5, -3).flatten(-3).flatten(-3, -2)
 
 
 def unpatchify(patches: Tensor, patch: int, grid: tuple[int, int]) -> Tensor:
-    """Convert patches (B, T, S, c*p*p) to latents (B, T, c, H, W), with `grid` = (H/p, W/p)."""
-    b, t, _, values = patches.shape
-    split = patches.reshape(b, t, *grid, values // patch**2, patch, patch)
-    return split.permute(0, 1, 4, 2, 5, 3, 6).reshape(b, t, -1, grid[0] * patch, grid[1] * patch)
+    """Convert patches (..., S, c*p*p) to latents (..., c, H, W), with `grid` = (H/p, W/p)."""
+    split = patches.unflatten(-1, (-1, patch, patch)).unflatten(-4, grid).movedim(-3, -5)
+    return split.transpose(-3, -2).flatten(-2).flatten(-3, -2)
 
 
 class TokenEmbedding(nn.Module):
@@ -196,6 +191,11 @@ class NoiseEmbedding(nn.Module):
 # -- actions
 
 
+def varying(mean: Tensor, std: Tensor) -> Tensor:
+    """Return which values (A,) vary; the float32 rounding of a constant is no variance."""
+    return std > 1e-6 * mean.abs() + 1e-9
+
+
 class Normalizer(nn.Module):
     """The normalisation of raw chunks to zero mean and unit variance, and its inverse.
 
@@ -232,7 +232,7 @@ class Normalizer(nn.Module):
             scale = self.std + 1e-10
             inverse = 1 / scale
         else:
-            varies = self.std > 1e-6 * self.mean.abs() + 1e-9  # a constant's float32 rounding is no variance
+            varies = varying(self.mean, self.std)
             scale = torch.where(varies, self.std, 0.0)
             inverse = torch.where(varies, 1 / self.std.clamp(min=1e-9), 0.0)
         kept = torch.where(self.normalize, self.mean, 0.0)

@@ -30,12 +30,12 @@ from hma_model.checkpoint.io import load, save
 from hma_model.checkpoint.weights import write_tensors
 from hma_model.config import ActionSpace, HMAConfig
 from hma_model.network.model import HMA
+from hma_model.network.states import check_fit, some_of
 from hma_model.released.config import LATENT_SCALE, config_from_released, config_to_released
 from hma_model.released.state import State, domains_of, state_from_released, state_to_released
 
 WEIGHTS = ("model.safetensors", "pytorch_model.bin")
 _PREFIXES = ("module.", "_orig_mod.")  # which wrappers add to the names of weights
-_MAX_NAMED = 3  # maximum number of names in an error
 
 
 def import_released(
@@ -123,7 +123,7 @@ def export_released(checkpoint: StrPath, out: StrPath, *, embodiments: Iterable[
     values["d_actions"] = [model.embodiments[name].chunk_dim for name in domains.values()] or None
     parts = {domain: (model.stem_state(name), model.head_state(name)) for domain, name in domains.items()}
     if waved := [name for name in domains.values() if model.stem(name).waves is not None]:
-        fault = f"the stem of {_some(waved)} takes waves of the actions; the released layout has none"
+        fault = f"the stem of {some_of(waved)} takes waves of the actions; the released layout has none"
         raise CheckpointError(opened.folder, fault, "the released code cannot read it")
     state = state_to_released(model.trunk_state(), parts, opened.config)
     for name, tensor in model.trunk_state().items():
@@ -176,25 +176,19 @@ def _check_fit(path: Path, state: State, config: HMAConfig, values: Mapping[str,
     domains = domains_of(state)
     named = values.get("action_domains") or []
     if lacking := [name for name in named if name not in domains]:
-        remedy = f"they have {_some(domains) or 'none'}; is it another model's {CONFIG}?"
-        raise CheckpointError(path, f"lacks the domains {_some(lacking)} that {CONFIG} names", remedy)
+        remedy = f"they have {some_of(domains) or 'none'}; is it another model's {CONFIG}?"
+        raise CheckpointError(path, f"lacks the domains {some_of(lacking)} that {CONFIG} names", remedy)
     with torch.device("meta"):  # names and shapes of the layout, from a model without data
         model = HMA(config)
         for domain in domains:
             model.add_embodiment(_space(path, state, domain))
         parts = {domain: (model.stem_state(domain), model.head_state(domain)) for domain in domains}
         made = state_to_released(model.trunk_state(), parts, config)
-    expected = {name: tuple(tensor.shape) for name, tensor in made.items()}
-    missing, extra = sorted(expected.keys() - state.keys()), sorted(state.keys() - expected.keys())
-    shapes = [
-        f"{name} is {list(state[name].shape)}, not {list(shape)}"
-        for name, shape in sorted(expected.items())
-        if name in state and tuple(state[name].shape) != shape
-    ]
-    kinds = {"lacks": missing, "has unknown": extra, "shapes differ:": shapes}
-    if faults := [f"{what} {_some(found)}" for what, found in kinds.items() if found]:
-        fault = f"is not the model that {CONFIG} describes: {'; '.join(faults)}"
-        raise CheckpointError(path, fault, f"give weights and {CONFIG} of one released checkpoint")
+    try:
+        check_fit(path, state, made)
+    except CheckpointError as wrong:
+        fault = f"is not the model that {CONFIG} describes: {wrong.fault}"
+        raise CheckpointError(path, fault, f"give weights and {CONFIG} of one released checkpoint") from wrong
 
 
 def _space(path: Path, state: State, domain: str) -> ActionSpace:
@@ -208,11 +202,6 @@ def _space(path: Path, state: State, domain: str) -> ActionSpace:
         fault = f"domain {domain!r} has chunks of {chunk} values and statistics of {dims}"
         raise CheckpointError(path, fault, "they are not of one model")
     return ActionSpace(domain, dims, chunk // dims, (0.0,) * dims, (1.0,) * dims, (True,) * dims, "divide")
-
-
-def _some(names: list[str]) -> str:
-    more = f" and {len(names) - _MAX_NAMED} more" if len(names) > _MAX_NAMED else ""
-    return ", ".join(names[:_MAX_NAMED]) + more
 
 
 # -- describing

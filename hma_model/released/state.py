@@ -16,6 +16,7 @@ from torch import Tensor
 
 from hma_data.errors import CheckpointError
 from hma_model.config import READOUTS, HMAConfig
+from hma_model.network.stem import varying
 
 State = dict[str, Tensor]
 Parts = dict[str, tuple[State, State]]
@@ -268,7 +269,7 @@ def _still(stem: State) -> Tensor:
     mean, std, normalize = (stem[f"normalizer.{name}"] for name in ("mean", "std", "normalize"))
     if "normalizer.divide" in stem:
         return torch.zeros_like(normalize)
-    return ~(std > 1e-6 * mean.abs() + 1e-9) & normalize
+    return ~varying(mean, std) & normalize
 
 
 def _modulation_back(stem: State, domain: str, config: HMAConfig) -> State:
