@@ -208,6 +208,11 @@ class HMAConfig:
         return self.layout == "released"
 
     @property
+    def discrete(self) -> bool:
+        """Return whether frames are VQ tokens; otherwise they are latents."""
+        return self.kind == "discrete"
+
+    @property
     def spec(self) -> "TokenizerSpec":
         """Return the spec of the tokenizer."""
         from hma_data.tokenizers.base import TokenizerSpec
@@ -217,19 +222,19 @@ class HMAConfig:
     @property
     def token_grid(self) -> tuple[int, int]:
         """Return (views · h, w), the grid of the tokens that the trunk sees in a frame."""
-        side = self.patch if self.kind == "continuous" else self.merge
+        side = self.merge if self.discrete else self.patch
         return self.views * self.grid[0] // side, self.grid[1] // side
 
     @property
     def frame_shape(self) -> tuple[int, ...]:
         """Return the shape of a frame: (views · h, w) of tokens, or (c, views · H, W) of latents."""
         grid = (self.views * self.grid[0], self.grid[1])
-        return grid if self.kind == "discrete" else (self.channels, *grid)
+        return grid if self.discrete else (self.channels, *grid)
 
     @property
     def crop_shape(self) -> tuple[int, ...]:
         """Return the shape of a frame that is cut to a square of `crop` tokens, as `frame_shape`."""
-        side = self.crop * (self.patch if self.kind == "continuous" else self.merge)
+        side = self.crop * (self.merge if self.discrete else self.patch)
         return (*self.frame_shape[:-2], self.views * side, side)
 
     @property
@@ -250,20 +255,24 @@ class HMAConfig:
         return self.action_tokens if self.absent_action == "tokens" else 0
 
     @property
+    def trained(self) -> list[Objective]:
+        """Return the objectives of the training."""
+        return [OBJECTIVES[name] for name, weight in self.objectives.items() if weight]
+
+    @property
     def predicts_video(self) -> bool:
         """Return whether an objective of the training predicts frames."""
-        return any(OBJECTIVES[name].predicts_video for name, weight in self.objectives.items() if weight)
+        return any(objective.predicts_video for objective in self.trained)
 
     @property
     def sees_actions(self) -> bool:
         """Return whether an objective of the training sees actions."""
-        return any(OBJECTIVES[name].sees_actions for name, weight in self.objectives.items() if weight)
+        return any(objective.sees_actions for objective in self.trained)
 
     @property
     def trained_readouts(self) -> tuple[Readout, ...]:
         """Return the readouts of actions that an objective of the training trains."""
-        chosen = [OBJECTIVES[name].readout for name, weight in self.objectives.items() if weight]
-        return tuple(readout for readout in chosen if readout is not None)
+        return tuple(objective.readout for objective in self.trained if objective.readout)
 
     @property
     def vocab_size(self) -> int:
@@ -299,6 +308,16 @@ class HMAConfig:
     def head_dim(self) -> int:
         """Return the width of one attention head."""
         return self.width // self.heads
+
+    @property
+    def attention_scale(self) -> float:
+        """Return the factor of attention's products."""
+        return 8 / self.head_dim if self.mup else self.head_dim**-0.5
+
+    @property
+    def readout_scale(self) -> float:
+        """Return the factor of the features that are read out; muP scales them down as the width grows."""
+        return self.base_width / self.width if self.mup else 1.0
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed, validated again."""
@@ -341,7 +360,7 @@ def _rules(config: HMAConfig) -> Iterator[tuple[str, bool, str]]:
     yield "latent_scale", 0 < config.latent_scale < math.inf, "a positive number"
     yield "action_waves", 0 <= config.action_waves <= 16, "a number from 0 to 16"
 
-    grid, discrete = config.grid, config.kind == "discrete"
+    grid, discrete = config.grid, config.discrete
     yield "grid", len(grid) == 2 and min(grid) >= 1, "(h, w), both at least 1"
     fits = bool(config.factored) and min(config.factored) >= 2
     yield "factored", fits, "at least one digit of at least two values"
@@ -391,7 +410,7 @@ def _unet_rules(config: HMAConfig) -> Iterator[tuple[str, bool, str]]:
     whole = config.whole_frames and not config.trained_readouts
     needs = "0: parts of frames need training_pass pairs, whole_share 1 and no objective that reads actions"
     yield "crop", not config.crop or whole, needs
-    local = config.kind == "discrete" or config.video_loss == "regression"
+    local = config.discrete or config.video_loss == "regression"
     yield "crop", not config.crop or local, "0: the diffusion head knows the place of each token of a frame"
 
 
@@ -441,6 +460,11 @@ class ActionSpace:
     def chunk_dim(self) -> int:
         """Return K = stride * action_dim."""
         return self.stride * self.action_dim
+
+    def stats(self) -> dict[str, Any]:
+        """Return the content of `stats.json` of a checkpoint."""
+        action = {"mean": list(self.mean), "std": list(self.std), "zero_variance": self.zero_variance}
+        return {"action": action}
 
     def agrees_with(self, other: "ActionSpace") -> bool:
         """Check whether two spaces are equal, up to the rounding of statistics to float32 in a stem."""

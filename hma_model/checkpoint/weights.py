@@ -122,7 +122,7 @@ def _require_network(config: "HMAConfig", state: Mapping[str, "Tensor"], where: 
         needed["layers"] = config.layers * width * max(width, hidden)
         needed["grid"] = config.tokens_per_frame * width
         needed["frames"] = config.frames * width if config.released else 0
-    if config.kind == "discrete":
+    if config.discrete:
         needed["factored"] = sum(config.digits) * width
     else:
         if config.video_loss == "diffusion":

@@ -110,7 +110,7 @@ def export_folder(
             "page": _write_parts(folder, step),
             "state": [vars(port) for port in step.state],
             "draws": [vars(port) for port in step.draws if port.law],
-            "temperature": world.decoding.temperature if model.config.kind == "discrete" else None,
+            "temperature": world.decoding.temperature if model.config.discrete else None,
             "robots": [],
         }
         known = holdings(model.source) if model.source else {}
@@ -177,7 +177,7 @@ def _write_robot(folder: Path, model: HMA, robot: Drivable, starts: Sequence[Sta
     chunks = Port("chunks", (2, model.embodiments[name].chunk_dim), "float32")
     stem = write_graph(home / "stem.onnx", StemGraph(model, name).eval(), [chunks], ["actions"])
     frames = np.stack([start.frames for start in starts])
-    if model.config.kind == "discrete":
+    if model.config.discrete:
         frames = frames.astype(np.int32)
     elif model.config.pixels:
         frames = frames.astype(np.uint8)

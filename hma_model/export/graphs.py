@@ -109,7 +109,7 @@ class StepGraph(nn.Module):
         self.decoder = tokenizer.network if isinstance(tokenizer, NetworkTokenizer) else None
         self.tokenizer, config = tokenizer, model.config
         self.steps = 1 if config.whole_frames else unmask_steps
-        self.slots, self.discrete = config.frames + 1, config.kind == "discrete"
+        self.slots, self.discrete = config.frames + 1, config.discrete
         own = "modulation" in config.conditioning and not config.shared_modulation
         width = config.width * (1 + 2 * config.layers * own)
         self.actions = Port("actions", (2, width), "float32")

@@ -8,12 +8,12 @@ from typing import Any
 
 from hma_data.errors import HubError
 from hma_data.hub.repository import Repository
-from hma_data.storage.files import json_object
 from hma_data.storage.paths import REPOSITORY, is_repository
 from hma_data.storage.yaml_io import write_yaml
 from hma_model.checkpoint.folder import README
 from hma_model.checkpoint.model_card import licence, line
 from hma_model.export.folder import FORMAT, MANIFEST
+from hma_model.hub.stores import read_object
 
 _NEW = {".gitattributes", README, "index.html", "style.css"}  # what the hub puts into a static Space
 _OTHER = "name another Space"
@@ -82,7 +82,7 @@ class Space:
         if README in files and (sdk := self._sdk()) != "static":
             raise HubError(self._store.name, f"is a Space of sdk {sdk!r}, not of static", _OTHER)
         if MANIFEST in files:
-            about = json_object(self._store.read(MANIFEST), f"{self._store.name}: {MANIFEST}", HubError)
+            about = read_object(self._store, MANIFEST)
             if about.get("format") == FORMAT:
                 return files
         if foreign := sorted(files.keys() - _NEW):

@@ -47,7 +47,7 @@ class Engine:
         trunk = model.get_submodule("trunk")
         self.trunk: nn.Module = packed(trunk, dtype) if pack else trunk
         # Scores of tokens stay float32; the diffusion head, most of a frame of latents, may be bfloat16.
-        half = dtype == torch.bfloat16 and model.config.kind == "continuous"
+        half = dtype == torch.bfloat16 and not model.config.discrete
         self.readout: nn.Module = (
             packed(model.readout, dtype if half else torch.float32) if pack else model.readout
         )

@@ -125,10 +125,8 @@ class Rollout:
             frames, actions, known, seeds: of these rows, as in `prompt`.
             embodiments: the rows' new ids; by default they keep theirs.
         """
-        chosen = self._chosen(rows)
+        chosen = self._chosen(rows, len(frames), "prompt")
         values = self.model.frame_values(frames).to(self.model.device)
-        if len(values) != len(chosen):
-            raise HMAError("prompt", f"has {len(values)} samples", f"give {len(chosen)}, one for each row")
         names = list(embodiments or [self.state.embodiments[row] for row in chosen])
         given = _prompt_chunks(self.model, names, actions, known, values.shape[1])
         last = slice(max(values.shape[1] - self.config.frames, 0), None)
@@ -153,9 +151,7 @@ class Rollout:
 
     def restore(self, rows: Sequence[int], snapshot: Snapshot) -> None:
         """Put rows into the state of a snapshot of as many rows, from any rollout with the same `cache`."""
-        chosen = self._chosen(rows)
-        if len(snapshot.times) != len(chosen):
-            raise HMAError("snapshot", f"has {len(snapshot.times)} rows", f"give one of {len(chosen)}")
+        chosen = self._chosen(rows, len(snapshot.times), "snapshot")
         if snapshot.caching != self.caching:  # frames lie elsewhere, and nothing or too little is computed
             raise HMAError("snapshot", f"is of cache={snapshot.caching}", "restore it into such a rollout")
         if self._clashes(snapshot.passive):
@@ -170,10 +166,13 @@ class Rollout:
         """Return the newest frame of some rows, by default all, in the form of `step`."""
         return self._show(self.state.newest(self._chosen(rows)))
 
-    def _chosen(self, rows: Sequence[int] | None) -> list[int]:
+    def _chosen(self, rows: Sequence[int] | None, given: int | None = None, what: str = "") -> list[int]:
+        """Return the numbers of rows; raise HMAError if they are none, or something is given of others."""
         chosen = list(range(self.batch) if rows is None else rows)
         if not chosen or len(set(chosen)) < len(chosen) or not 0 <= min(chosen) <= max(chosen) < self.batch:
             raise HMAError("rows", f"{chosen} are not rows", f"give some of 0 to {self.batch - 1}, each once")
+        if given not in (None, len(chosen)):
+            raise HMAError(what, f"is of {given} rows", f"give one of {len(chosen)}")
         return chosen
 
     def _clashes(self, passive: bool | None) -> bool:
@@ -232,10 +231,8 @@ class Rollout:
             frames: tokens (n, h, w) int64, or latents (n, c, H, W) as stored.
             chunk, known, rows: as in `step`; the commands that led to the frame.
         """
-        chosen = self._begun(rows)
+        chosen = self._chosen(self._begun(rows), len(frames), "observe")
         values = self.model.frame_values(frames.unsqueeze(1)).to(self.model.device)[:, 0]
-        if len(values) != len(chosen):
-            raise HMAError("observe", f"gets {len(values)} frames", f"give {len(chosen)}, one for each row")
         self._make_room(chosen)
         self._take(chosen, chunk, None, known)  # before the cache, whose tokens it decides
         if self.caching:
@@ -341,14 +338,14 @@ class Rollout:
         """Return new frames (n, S) of rows, wholly masked."""
         values, generators = self.state.blank(len(rows)), self.state.drawing(rows)
         newest = self.state.newest(rows) if self.config.copy_previous else None
-        if self.config.kind == "discrete":
+        if self.config.discrete:
             before = None if newest is None else known_digits(newest, self.config)
             return TokenFrame(values, self.config.mask_id, self.decoding, generators, before=before)
         return PatchFrame(values, self.decoding, generators, newest)
 
     def _show(self, values: Tensor) -> Tensor:
         config = self.config
-        if config.kind == "discrete":
+        if config.discrete:
             return split_tokens(values, config.merge, config.vocab_size, config.token_grid)
         shown = unpatchify(values, config.patch, config.token_grid) / config.latent_scale
         return shown.round() if config.pixels else shown  # the scale is not exact in float32

@@ -126,7 +126,7 @@ class RowState:
     def blank(self, rows: int) -> Tensor:
         """Return frames (n, S) of masked tokens, or of zero patches (n, S, C)."""
         shape, device = (rows, self.config.tokens_per_frame), self.model.device
-        if self.config.kind == "discrete":
+        if self.config.discrete:
             return torch.full(shape, self.config.mask_id, device=device)
         return torch.zeros(*shape, self.config.patch_dim, device=device)
 

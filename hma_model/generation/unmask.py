@@ -47,7 +47,7 @@ class Decoding:
     def of(cls, config: HMAConfig, temperature: float | None = None, **others: Any) -> "Decoding":
         """Return the settings for a model, with its own temperature by default; raise as `check`."""
         if temperature is None:
-            drawn = config.kind == "discrete" and not config.whole_frames  # one pass cannot make draws agree
+            drawn = config.discrete and not config.whole_frames  # one pass cannot make draws agree
             temperature = TEMPERATURE if drawn else 0.0
         made = cls(temperature=temperature, **others)
         check(made, config)

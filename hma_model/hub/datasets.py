@@ -31,8 +31,7 @@ from hma_model.hub.stores import Store, open_store
 _OWN_FILES = {*SMALL, MANIFEST, *FILES_BESIDE}
 _PULL_AGAIN = "pull again; if the error stays, push it again"
 _DATASETS = "hf://datasets/"
-_SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"),
-          (10**7, "1M<n<10M"), (10**8, "10M<n<100M"), (10**9, "100M<n<1B"), (10**10, "1B<n<10B"))  # fmt: skip
+_BOUNDS = ("1K", "10K", "100K", "1M", "10M", "100M", "1B", "10B", "100B", "1T")  # of the hub's categories
 _SPLITS = {"train": "train", "val": "validation"}  # our names, and the hub's names
 
 
@@ -203,11 +202,21 @@ def _front(manifest: Manifest) -> dict[str, Any]:
     return {
         **licence([manifest.embodiment.license]),
         "task_categories": ["robotics"],
-        "size_categories": [next((name for most, name in _SIZES if rows < most), "n>1T")],
+        "size_categories": [_size_category(rows)],
         "tags": ["robotics", "hma", "world-model", f"embodiment:{manifest.embodiment.id}",
                  f"tokenizer:{manifest.tokenizer.name}"],
         "configs": configs if frames else configs[1:],
     }  # fmt: skip
+
+
+def _size_category(rows: int) -> str:
+    """Return the hub's word for a number of rows, such as `10K<n<100K`."""
+    reached = max(0, len(str(rows)) - 3)  # bounds, each ten times the one before
+    if reached == 0:
+        return f"n<{_BOUNDS[0]}"
+    if reached >= len(_BOUNDS):
+        return f"n>{_BOUNDS[-1]}"
+    return f"{_BOUNDS[reached - 1]}<n<{_BOUNDS[reached]}"
 
 
 def _rows(manifest: Manifest) -> list[list[str]]:

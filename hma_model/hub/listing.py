@@ -7,10 +7,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from hma_data.errors import HMAError, HubError, PluginError, TokenizerError
-from hma_data.storage.files import json_object
 from hma_data.storage.paths import StrPath
 from hma_model.checkpoint.folder import CARD, CONFIG, LIBRARY, PARTS, TRUNK, digest, parse_config, value_of
-from hma_model.hub.stores import Store, embodiment_ids, open_store
+from hma_model.hub.stores import Store, embodiment_ids, open_store, read_object
 
 RELEASED_WEIGHTS = ("model.safetensors", "pytorch_model.bin")
 FIGURES = ("val_loss", "baseline_loss", "psnr", "ssim")
@@ -59,7 +58,7 @@ def _checkpoint(store: Store, files: Mapping[str, int], root: str) -> dict[str, 
         "embodiments": [], "from_cache": store.from_cache,
     }  # fmt: skip
     try:
-        values = json_object(store.read(root + CONFIG), f"{where}/{CONFIG}", HubError)
+        values = read_object(store, root + CONFIG)
     except HMAError as fault:
         return facts | {"problems": [fault.fault]} if TRUNK in inside else None
     if values.get("library") == LIBRARY:
@@ -100,7 +99,7 @@ def _add_ours(
         wrong = [f"{lacks} {part}" for part in PARTS if f"{home}/{part}" not in files]
         size = None if wrong and store.from_cache else sum(files.get(f"{home}/{part}", 0) for part in PARTS)
         try:
-            card = json_object(store.read(f"{root}{home}/{CARD}"), f"{where}/{home}/{CARD}", HubError)
+            card = read_object(store, f"{root}{home}/{CARD}")
             if card.get("trunk_sha256") != values.get("trunk_sha256"):
                 wrong.append("belongs to another trunk")
             if isinstance(tokenizer, dict) and card.get("tokenizer") != digest(tokenizer):

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from hma_data.errors import CheckpointError, HMAError, HubError
 from hma_data.registry.embodiment import find
-from hma_data.storage.files import cache_folder, json_object
+from hma_data.storage.files import cache_folder
 from hma_data.storage.paths import StrPath, addressed, as_address, as_path, is_repository
 from hma_data.storage.remote import RemotePath
 from hma_model.checkpoint import io as checkpoints
@@ -33,7 +33,7 @@ from hma_model.checkpoint.folder import (
     parse_config,
 )  # fmt: skip
 from hma_model.checkpoint.model_card import JUDGED, render
-from hma_model.hub.stores import FolderStore, Store, embodiment_ids, open_published, open_store
+from hma_model.hub.stores import FolderStore, Store, embodiment_ids, open_published, open_store, read_object
 
 if TYPE_CHECKING:
     import torch
@@ -119,8 +119,7 @@ def push_model(model: "HMA", target: StrPath, embodiments: Iterable[str] | None 
             text = "has no YAML where the model was loaded from, nor in the registry"
             remedy = "save with hma_model.checkpoint.io.save and push the folder"
             raise HubError(f"embodiment {name}", text, remedy) from fault
-        action = {"mean": list(space.mean), "std": list(space.std), "zero_variance": space.zero_variance}
-        stats[name] = {"action": action}
+        stats[name] = space.stats()
     with tempfile.TemporaryDirectory() as folder:
         saved = checkpoints.save(
             model, Path(folder) / "model", embodiment_yaml=yaml, stats=stats, cards=cards, base=base
@@ -192,7 +191,7 @@ def _changes(
     for name, path in others.items():
         cards[name] = {}
         with suppress(HubError):  # a card of somebody else that cannot be read stops no push
-            cards[name] = json_object(store.read(path), f"{store.name}: {path}", HubError)
+            cards[name] = read_object(store, path)
     after = {path for path in {*files, *changes} if changes.get(path, b"") is not None}
     samples = {path.removeprefix("embodiments/") for path in after if path.endswith(PICTURES)}
     config = checkpoints.config_json(source.config, source.trunk_sha256)
@@ -307,9 +306,9 @@ def _config(store: Store, files: dict[str, int]) -> dict[str, Any]:
         raise HubError(
             store.name, f"has no {CONFIG}", "it is not a checkpoint of hma-toolkit; check the name"
         )
-    values = json_object(store.read(CONFIG), f"{store.name}: {CONFIG}", HubError)
+    values = read_object(store, CONFIG)
     try:
-        parse_config(values, f"{store.name}: {CONFIG}")
+        parse_config(values, f"{store.name}/{CONFIG}")
     except CheckpointError as fault:
         raise HubError(fault.where, fault.fault, fault.remedy) from fault
     return values

@@ -13,6 +13,7 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from hma_data.errors import HubError, MissingDependencyError, OutputError, StorageAwayError, StorageError
 from hma_data.hub.repository import Repository
@@ -22,6 +23,7 @@ from hma_data.storage.files import (
     PART,
     atomic_path,
     file_sha256,
+    json_object,
     part_of,
     remove_dead_parts,
     sync_folder,
@@ -223,6 +225,11 @@ def open_published(source: StrPath, revision: str | None) -> tuple[Store, dict[s
         both = f"is not a local folder; as a repository of the hub: {fault.fault}"
         remedy = f"give the path of a checkpoint or run, or: {fault.remedy}"
         raise HubError(name, both, remedy) from fault
+
+
+def read_object(store: Store, name: str) -> dict[str, Any]:
+    """Return the values of a JSON file of a hub; raise HubError if it holds no object."""
+    return json_object(store.read(name), f"{store.name}/{name}", HubError)
 
 
 def embodiment_ids(files: Iterable[str]) -> list[str]:

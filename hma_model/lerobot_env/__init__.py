@@ -74,7 +74,8 @@ class HMAEnvConfig(EnvConfig):
     def __post_init__(self) -> None:
         with in_one_line():
             refuse_own_checkpoint()
-            self._read(self._located())
+            checkpoint, self.embodiment = opened(self.checkpoint, self.embodiment, "--env.embodiment")
+            self._read(checkpoint)
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
@@ -91,19 +92,15 @@ class HMAEnvConfig(EnvConfig):
                 temperature=self.temperature,
             )  # fmt: skip
             read_prompt(world.model, self.embodiment, self.prompt)  # or a refusal before what takes minutes
-            env = made(self._located(), self.embodiment, n_envs, world, vars(self))
+            checkpoint = located(self.checkpoint, [self.embodiment])[0]
+            env = made(checkpoint, self.embodiment, n_envs, world, vars(self))
             _ = env.reader, env.judge  # what they say of themselves comes before the evaluation
             return {self.type: {0: env}}
-
-    def _located(self) -> Checkpoint:
-        return located(self.checkpoint, [self.embodiment] if self.embodiment else None)[0]
 
     def _read(self, checkpoint: Checkpoint) -> None:
         """Complete what the checkpoint says."""
         if self.horizon < 1:
             raise UsageError("horizon", f"is {self.horizon}", "give 1 or more")
-        if not self.embodiment:
-            self.embodiment = only_embodiment(checkpoint, "--env.embodiment")
         if self.judge is not None:
             judged_task(self.embodiment, self.judge)
         robot = checkpoint.embodiment(self.embodiment)
@@ -127,13 +124,13 @@ class HMAEnvConfig(EnvConfig):
         self.features_map = {key: own.get(key, key) for key in self.features}
 
 
-def only_embodiment(checkpoint: Checkpoint, option: str) -> str:
-    """Return the one embodiment of a checkpoint; a UsageError asks for the option if there are more."""
-    if len(checkpoint.embodiments) != 1:
+def opened(source: str, embodiment: str, option: str) -> tuple[Checkpoint, str]:
+    """Return a checkpoint and its embodiment; if none is named, a UsageError asks for the option."""
+    checkpoint, names = located(source, [embodiment] if embodiment else None)
+    if len(names) != 1:
         there = ", ".join(checkpoint.embodiments)
         raise UsageError("embodiment", "is not given", f"give {option}=ID; the model has: {there}")
-    (found,) = checkpoint.embodiments
-    return found
+    return checkpoint, names[0]
 
 
 def made(

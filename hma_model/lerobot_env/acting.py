@@ -26,8 +26,7 @@ from torch import Tensor
 
 from hma_data.errors import UsageError
 from hma_model.config import POLICY
-from hma_model.hub.publish import located
-from hma_model.lerobot_env import in_one_line, only_embodiment
+from hma_model.lerobot_env import in_one_line, opened
 from hma_model.lerobot_env.vector import camera_names
 from hma_model.worlds.world import load_world
 
@@ -72,8 +71,7 @@ class WorldModelPolicy(PreTrainedPolicy):
     def __init__(self, config: WorldModelConfig, **unused: Any) -> None:
         super().__init__(config)
         with in_one_line():
-            checkpoint, _ = located(config.checkpoint, [config.embodiment] if config.embodiment else None)
-            self._embodiment = config.embodiment or only_embodiment(checkpoint, "--policy.embodiment")
+            checkpoint, self._embodiment = opened(config.checkpoint, config.embodiment, "--policy.embodiment")
             self._cameras = camera_names(checkpoint, self._embodiment)
             self._world = load_world(
                 config.checkpoint,

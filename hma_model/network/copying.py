@@ -49,7 +49,7 @@ class CopyGain(nn.Module):
     def __init__(self, config: HMAConfig) -> None:
         super().__init__()
         self.digits = len(config.digits)
-        self.multiplier = SCALE * (config.base_width / config.width if config.mup else 1.0)
+        self.multiplier = SCALE * config.readout_scale
         self.token_digits = self.digits // config.merge**2
         self.linear = Linear(config.width, self.digits * STATES)
         nn.init.zeros_(self.linear.weight)
@@ -117,7 +117,7 @@ class PatchCopy(nn.Module):
 
     def __init__(self, config: HMAConfig) -> None:
         super().__init__()
-        self.multiplier = SCALE * (config.base_width / config.width if config.mup else 1.0)
+        self.multiplier = SCALE * config.readout_scale
         self.linear = Linear(config.width, config.patch_dim)
         nn.init.zeros_(self.linear.weight)
         nn.init.constant_(self.linear.bias, START_LOGIT)

@@ -75,6 +75,11 @@ def nearby(generator: torch.Generator | None, device: torch.device) -> torch.Gen
 type Choose = Callable[[Tensor, int], Tensor]
 
 
+def scaled(features: Tensor, multiplier: float) -> Tensor:
+    """Return features times a number, without an operation if it is 1."""
+    return features if multiplier == 1 else features * multiplier
+
+
 class DigitChain(nn.Module):
     """The gain of a digit's scores from the digits before it: an MLP of features and embedded digits.
 
@@ -84,7 +89,7 @@ class DigitChain(nn.Module):
     def __init__(self, config: HMAConfig) -> None:
         super().__init__()
         width, digits = config.width, config.digits
-        self.multiplier = config.base_width / config.width if config.mup else 1.0
+        self.multiplier = config.readout_scale
         self.input = Linear(width, width, bias=False)
         nn.init.normal_(self.input.weight, std=width**-0.5)
         self.place = nn.Parameter(torch.randn(len(digits), width) * 0.5)
@@ -117,8 +122,7 @@ class DigitChain(nn.Module):
         return torch.einsum("...fd,fvd->...fv", hidden, torch.stack(list(self.output))).flatten(-2)
 
     def _hidden(self, so_far: Tensor) -> Tensor:
-        hidden = F.gelu(so_far)
-        return hidden * self.multiplier if self.multiplier != 1 else hidden
+        return scaled(F.gelu(so_far), self.multiplier)
 
 
 class TokenReadout(nn.Module):
@@ -134,7 +138,7 @@ class TokenReadout(nn.Module):
     def __init__(self, config: HMAConfig) -> None:
         super().__init__()
         self.factored, self.smoothing = config.digits, config.label_smoothing
-        self.multiplier = config.base_width / config.width if config.mup else 1.0
+        self.multiplier = config.readout_scale
         self.linear = Linear(config.width, sum(config.digits))
         worth = torch.tensor([1, *accumulate(config.digits[:-1], mul)])
         self.register_buffer("worth", worth, persistent=False)  # on the device, where code is compiled
@@ -181,7 +185,7 @@ class TokenReadout(nn.Module):
         return self.chain.decide(features, alone, choose)
 
     def _alone(self, features: Tensor) -> Tensor:
-        return self.linear(features * self.multiplier if self.multiplier != 1 else features).float()
+        return self.linear(scaled(features, self.multiplier)).float()
 
     def taken(self, scores: Tensor) -> Tensor:
         """Return the values (..., k, F) of a frame's scores (..., k, F, V): the likeliest, or its colours."""
@@ -227,8 +231,7 @@ class TokenReadout(nn.Module):
         gains = None
         if self.copy is not None and before is not None:
             gains, before = self.copy.gains(features, before)[..., 0], before.clamp(min=0)
-        features = features * self.multiplier if self.multiplier != 1 else features
-        return cross_entropy(features, self.linear, gains, before, digits)
+        return cross_entropy(scaled(features, self.multiplier), self.linear, gains, before, digits)
 
 
 class LatentReadout(nn.Module):
@@ -368,7 +371,7 @@ class ActionHead(nn.Module):
         if config.action_loss == "diffusion":
             self.diffusion = DiffusionHead(config, space.chunk_dim)
             outputs = config.width
-        self.multiplier = config.base_width / config.width if config.mup else 1.0
+        self.multiplier = config.readout_scale
         self.policy = Linear(config.width, outputs)
         self.inverse = Linear(config.width, outputs)
         for linear in (self.policy, self.inverse):
@@ -378,7 +381,7 @@ class ActionHead(nn.Module):
     def forward(self, features: Tensor, readout: Readout) -> Tensor:
         """Map features (M, D) to chunks (M, K), or to the conditions (M, D) of a diffusion head."""
         linear: nn.Linear = getattr(self, readout.name)
-        return linear(features * self.multiplier if self.multiplier != 1 else features)
+        return linear(scaled(features, self.multiplier))
 
     def loss(
         self, features: Tensor, target: Tensor, readout: Readout, generator: torch.Generator | None = None

@@ -50,7 +50,7 @@ class Network(nn.Module):
         self.embodiments: dict[str, ActionSpace] = {}
         self.source: Checkpoint | None = None
         self.trunk: Trunk = TRUNKS[config.trunk](config)
-        if config.kind == "discrete":
+        if config.discrete:
             self.readout: nn.Module = TokenReadout(config)
         else:
             diffuses = config.video_loss == "diffusion"
@@ -199,7 +199,7 @@ class Network(nn.Module):
         if shape != wanted:
             fault = f"a frame has the shape {shape}, but the model takes {wanted}"
             raise HMAError("frames", fault, "use the model's tokenizer")
-        if config.kind == "discrete":
+        if config.discrete:
             return merge_tokens(frames.long(), config.merge, config.vocab_size)
         return patchify(frames.float() * config.latent_scale, config.patch)
 
@@ -220,7 +220,7 @@ class Network(nn.Module):
                 follow one another.
             corruption: (B, T) the corruption of each frame that the model is told; by default nothing is.
         """
-        if masked is None and self.config.kind == "continuous":
+        if masked is None and not self.config.discrete:
             masked = torch.zeros_like(frames[..., :1], dtype=torch.bool)
         order = range(-1, frames.shape[1] - 1) if previous is None else previous
         return self.trunk.embed_frames(frames, masked, order, corruption)
@@ -244,7 +244,7 @@ class Network(nn.Module):
         """Raise HMAError unless an objective of the training trained a readout: else it returns noise."""
         if readout in self.config.trained_readouts:
             return
-        objectives = ", ".join(name for name, weight in self.config.objectives.items() if weight)
+        objectives = ", ".join(objective.name for objective in self.config.trained)
         wanted = [f"{{{name}: 1.0}}" for name, one in OBJECTIVES.items() if one.readout == readout]
         fault = f"was not trained to {readout.deed}, but for {objectives}"
         raise HMAError(where or self.name, fault, f"train one with objectives={' or '.join(wanted)}")

@@ -84,7 +84,7 @@ class Layout:
         if objective.readout:
             return cls.pairs(model, count, past=count)
         layout = cls.pairs(model, count, past=count - 1)
-        if model.training or model.config.kind == "continuous":  # else the window's first frame is scored
+        if model.training or not model.config.discrete:  # else the window's first frame is scored
             layout.times.wanted = layout.past
         return layout
 
@@ -115,7 +115,7 @@ def compute(
     if name not in OBJECTIVES:
         raise HMAError("objective", f"{name!r} is unknown", "give one of " + ", ".join(OBJECTIVES))
     chosen = OBJECTIVES[name]
-    stored = batch.tokens if config.kind == "discrete" else batch.latents
+    stored = batch.tokens if config.discrete else batch.latents
     if stored is None:
         raise HMAError("batch", f"has no frames for a {config.kind} model", "use the model's tokenizer")
     places, groups = _optional(batch, "places"), Groups.of(batch.embodiment, len(batch.actions))
@@ -152,7 +152,7 @@ def compute(
         video_loss, per_sample = _video_loss(model, own, targets, before, masked, groups, generator)
         if layout.paired:  # no copy is of the first frame
             masked = F.pad(masked, (0, 0, 1, 0))
-        if config.kind == "discrete" and not model.training:
+        if config.discrete and not model.training:
             logits = _video_logits(model, features, own, before, frames, layout, groups)
     loss = torch.zeros((), device=features.device)
     loss = loss if video_loss is None else loss + video_loss
@@ -171,7 +171,7 @@ def readout_inputs(
     """
     config, previous = model.config, layout.previous[layout.predicted]
     own = model.video_features(features)[:, layout.predicted]
-    if config.kind == "discrete":
+    if config.discrete:
         return own, frames_before(shown, previous, config) if config.copy_previous else None
     kept = None
     if config.copy_previous:
@@ -272,7 +272,7 @@ def _embed(
     frames = true if context is None else model.frame_values(context, _optional(batch, "places"))
     if layout.paired:
         frames = torch.cat([frames[:, : layout.past], true[:, 1:]], dim=1)
-    if model.config.kind == "discrete":
+    if model.config.discrete:
         shown = groups.sort(corrupt_tokens(model.config, frames, video, generator))
         hidden = None
     else:
@@ -314,7 +314,7 @@ def _video_loss(
         )
     )
     assert chosen is not None and targets is not None
-    if model.config.kind == "discrete":
+    if model.config.discrete:
         losses = model.token_readout.loss(chosen, to_digits(targets, model.config.digits), near)
     else:
         losses = model.latent_readout.loss(targets, chosen, generator, near)

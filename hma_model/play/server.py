@@ -448,7 +448,7 @@ async def serve(
         robots |= part.robots
         known = holdings(part.checkpoint)
         held |= {key: known[robot.embodiment.id] for key, robot in part.robots.items()}
-    confidence = ("confidence",) if all(part.checkpoint.config.kind == "discrete" for part in parts) else ()
+    confidence = ("confidence",) if all(part.checkpoint.config.discrete for part in parts) else ()
     stepper = Stepper(worlds, robots, orders=("random", *confidence))
     stepper.start()
     try:

@@ -21,6 +21,7 @@ from functools import partial
 from typing import Any
 
 from hma_data.errors import HMAError, UsageError
+from hma_data.storage.kinds import one_line
 from hma_model.arrays import Float32s
 from hma_model.generation.unmask import Decoding
 from hma_model.play.session import Session, Viewer
@@ -228,5 +229,4 @@ class Stepper:
 
 
 def _line(fault: Exception) -> str:
-    text = str(fault) if isinstance(fault, HMAError) else f"{type(fault).__name__}: {fault}"
-    return " ".join(text.split())[:300]
+    return one_line(fault if isinstance(fault, HMAError) else f"{type(fault).__name__}: {fault}", 300)

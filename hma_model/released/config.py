@@ -167,7 +167,7 @@ def _continuous(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def config_to_released(config: HMAConfig, where: object) -> dict[str, Any]:
     """Convert a configuration to the released `config.json`, without its action domains."""
-    discrete = config.kind == "discrete"
+    discrete = config.discrete
     named = {"concat": "concat", "modulation": "modulate", "add": "mlp"}
     same = _SAME | _SAME_DISCRETE | ({} if discrete else _SAME_CONTINUOUS)
     values = {theirs: getattr(config, ours) for theirs, ours in same.items()} | {
@@ -192,11 +192,9 @@ def config_to_released(config: HMAConfig, where: object) -> dict[str, Any]:
         ]
     except CheckpointError as error:
         faults = [error.fault]
-    trained = [name for name, weight in config.objectives.items() if weight > 0]
-    for name in sorted(trained):
-        readout = OBJECTIVES[name].readout
-        if readout == INVERSE or (readout == POLICY and config.absent_action != "tokens"):
-            faults.append(f"objective {name} with absent_action {config.absent_action!r}")
+    for one in sorted(config.trained, key=lambda one: one.name):
+        if one.readout == INVERSE or (one.readout == POLICY and config.absent_action != "tokens"):
+            faults.append(f"objective {one.name} with absent_action {config.absent_action!r}")
     if faults:
         fault = f"the released layout cannot express {'; '.join(faults)}"
         raise CheckpointError(where, fault, "the released code cannot read it")

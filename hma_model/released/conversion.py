@@ -89,8 +89,7 @@ def import_released(
     yaml, stats, cards = {}, {}, {}
     for domain, name in names.items():
         space = model.embodiments[name]
-        action = {"mean": list(space.mean), "std": list(space.std), "zero_variance": space.zero_variance}
-        yaml[name], stats[name] = _yaml(domain, space), {"action": action}
+        yaml[name], stats[name] = _yaml(domain, space), space.stats()
         cards[name] = {"data": {"released_checkpoint": origin, "released_domain": domain}}
     return save(model, out, embodiment_yaml=yaml, stats=stats, cards=cards)
 
@@ -226,7 +225,7 @@ def _choose(domains: list[str], wanted: Iterable[str] | None, path: Path) -> dic
 
 def _tokenizer_spec(config: HMAConfig, name: str | None, folder: Path) -> TokenizerSpec:
     """Return the tokenizer's spec, without the hash of its weights, which the release does not state."""
-    discrete = config.kind == "discrete"
+    discrete = config.discrete
     paper = config.vocab_size == 2**18 if discrete else config.channels == 4
     known = find_entry(name) if name else None
     if known and (known.kind, known.grid) != (config.kind, config.grid):

@@ -86,7 +86,7 @@ def state_to_released(
     }
     for theirs, ours in _norms(config):
         released |= _move(trunk, f"{ours}.q_norm", theirs)
-    if config.kind == "continuous":
+    if not config.discrete:
         released |= _patches_back(trunk, config)
     else:
         released["token_embed.mask_token_embed"] = trunk["trunk.embed.mask"].unsqueeze(0)
@@ -103,7 +103,7 @@ def _renamed(config: HMAConfig) -> dict[str, str]:
         for theirs, ours in _BLOCK.items():
             if not (config.qk_norm and theirs.startswith("norm")):
                 names[f"decoder.layers.{layer}.{theirs}"] = f"trunk.blocks.{layer}.{ours}"
-    if config.kind == "discrete":
+    if config.discrete:
         return names | {"out_x_proj": "readout.linear"}
     names |= {"z_proj_ln": "trunk.embed_norm", "out_x_proj": "readout.proj", "decoder_norm": "readout.norm"}
     return names | _diffusion("diffloss.net", "readout.diffusion", config)
@@ -145,7 +145,7 @@ def _trunk(source: State, config: HMAConfig) -> State:
     }
     for theirs, ours in _norms(config):
         trunk |= _move(source, theirs, f"{ours}.q_norm") | _move(source, theirs, f"{ours}.k_norm")
-    if config.kind == "continuous":
+    if not config.discrete:
         return trunk | _latents(source, trunk, config)
     trunk["trunk.embed.mask"] = source["token_embed.mask_token_embed"][0]
     return trunk | {ours: source[theirs] for theirs, ours in _digits(config).items()}

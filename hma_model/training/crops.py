@@ -30,7 +30,7 @@ def cropped(config: HMAConfig, batch: Batch, generator: torch.Generator | None) 
     """
     frames = batch.stored
     side, width = config.crop, config.token_grid[1]
-    cell = config.merge if config.kind == "discrete" else config.patch
+    cell = config.merge if config.discrete else config.patch
     corners = _corners(config, _moving(frames, cell, config.views).cpu(), generator).to(frames.device)
     rows, columns = corners.unsqueeze(-1) + torch.arange(side, device=frames.device)  # (B, C) each
     places = (rows.unsqueeze(2) * width + columns.unsqueeze(1)).flatten(1)

@@ -51,7 +51,7 @@ class HeldOut:
             "loss_by_embodiment": found.by_embodiment(),
             "windows": len(found.samples),
         }
-        if video and model.config.kind == "discrete":
+        if video and model.config.discrete:
             if self._baseline is None:
                 self._baseline = losses.unconditional_baseline(
                     self._all.values(), self._batches(), model.config, recipe.cameras

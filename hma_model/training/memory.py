@@ -56,7 +56,7 @@ def activation_bytes(config: HMAConfig, recipe: Recipe, windows: int, device: to
         block *= BF16_SHARE
     kept = CHECKPOINT_VALUES * config.layers + block if recipe.checkpointing else block * config.layers
     hidden = windows * predicted * config.tokens_per_frame * HIDDEN_SHARE
-    if config.kind == "discrete":
+    if config.discrete:
         read = _score_values(config, recipe, device)
     else:
         read = int(DIFFUSION_VALUES * config.diffusion_depth * config.diffusion_width)
@@ -65,7 +65,7 @@ def activation_bytes(config: HMAConfig, recipe: Recipe, windows: int, device: to
 
 def _score_values(config: HMAConfig, recipe: Recipe, device: torch.device) -> int:
     """Return how many values are kept for the scores of a token."""
-    if config.kind != "discrete":
+    if not config.discrete:
         return 0
     digits = config.digits
     if config.digit_order == "chain":

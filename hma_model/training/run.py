@@ -203,7 +203,7 @@ class Run:
         if self.start:
             self._begin_like(self.start.checkpoint)
             return
-        if self.model.config.kind != "discrete":
+        if not self.model.config.discrete:
             return
         drawn = zip(self.train_data.mixture.p, self.sets.values())
         given = self.model.config.factored, self.recipe.cameras

@@ -78,12 +78,12 @@ def _predicted(
     shown = groups.sort(model.frame_values(context[rows], places))
     hidden = torch.zeros(*shown.shape[:3], 1, dtype=torch.bool, device=shown.device)
     hidden[:, past] = True
-    if config.kind == "discrete":
+    if config.discrete:
         shown[:, past] = config.mask_id
     x = model.embed(shown, hidden)
     features = model.trunk(x, model.condition(given, groups, times.positions), times)
     own = model.video_features(features)[:, past:]
-    if config.kind == "discrete":
+    if config.discrete:
         before = frames_before(shown, [past - 1], config) if config.copy_previous else None
         scores = model.token_readout.split(model.token_readout(own, None, before))
         tokens = groups.unsort(from_digits(model.token_readout.taken(scores), config.digits))

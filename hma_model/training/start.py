@@ -105,7 +105,7 @@ class Start:
         for key, value in recipe.model.items():
             if key in OF_THE_TRUNK and self.frozen:
                 continue  # for waves, `waves` looks after them: each stem may have its own
-            if key == "copy_previous" and config.kind == "continuous":
+            if key == "copy_previous" and not config.discrete:
                 continue  # latents are copied from the first step on, which a trained readout does not expect
             if key == WAVES or key in TRAINED_BY or (key in self._off() and not self.frozen):
                 changes[key] = value

@@ -228,7 +228,7 @@ class World:
             images = fitted(frames, config, described(self.model, embodiment))
             views = [self.tokenizer.encode(view) for view in np.split(images, config.views, axis=2)]
             frames = np.concatenate(views, axis=-2)
-        if config.kind != "discrete":
+        if not config.discrete:
             return frames.astype(np.float32)
         ids = frames.astype(np.int64)
         if not 0 <= ids.min() <= ids.max() < config.vocab_size:

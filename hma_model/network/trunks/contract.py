@@ -173,7 +173,7 @@ class BlockTrunk(nn.Module):
         super().__init__()
         self.config = config
         self.checkpointing = False
-        self.embed = TokenEmbedding(config) if config.kind == "discrete" else LatentEmbedding(config)
+        self.embed = TokenEmbedding(config) if config.discrete else LatentEmbedding(config)
         self.noise = NoiseEmbedding(config) if config.told_noise else None
 
     def embed_frames(

@@ -139,7 +139,7 @@ class Attention(nn.Module):
         super().__init__()
         width = config.width
         self.heads, self.normed = config.heads, config.qk_norm
-        self.scale = 8 / config.head_dim if config.mup else config.head_dim**-0.5
+        self.scale = config.attention_scale
         self.qkv = Linear(width, 3 * width, bias=config.qkv_bias)
         self.proj = Linear(width, width)
         self.q_norm = nn.LayerNorm(config.head_dim) if config.qk_norm else nn.Identity()
@@ -242,7 +242,7 @@ class ActionAttention(nn.Module):
         super().__init__()
         width = config.width
         self.heads = config.heads
-        self.scale = 8 / config.head_dim if config.mup else config.head_dim**-0.5
+        self.scale = config.attention_scale
         self.q = Linear(width, width, bias=config.qkv_bias)
         self.kv = Linear(width, 2 * width, bias=config.qkv_bias)
         self.proj = Linear(width, width)
@@ -349,7 +349,7 @@ class Transformer(BlockTrunk):
         if config.position_init == "sinusoid":
             with torch.no_grad():
                 self.position[:, : config.tokens_per_frame] = sinusoids(config.token_grid, config.width)
-        continuous = config.kind == "continuous"
+        continuous = not config.discrete
         self.embed_norm = nn.LayerNorm(config.width, eps=1e-6) if continuous else nn.Identity()
         self.absent = nn.Parameter(torch.randn(positions, config.width) * 0.02)
         self.modulation: Modulation | None = None
