@@ -172,7 +172,7 @@ class Rollout:
         if not chosen or len(set(chosen)) < len(chosen) or not 0 <= min(chosen) <= max(chosen) < self.batch:
             raise HMAError("rows", f"{chosen} are not rows", f"give some of 0 to {self.batch - 1}, each once")
         if given not in (None, len(chosen)):
-            raise HMAError(what, f"is of {given} rows", f"give one of {len(chosen)}")
+            raise HMAError(what, f"has {given} rows, {len(chosen)} are chosen", "give one for each")
         return chosen
 
     def _clashes(self, passive: bool | None) -> bool:
