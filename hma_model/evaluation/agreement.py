@@ -1,19 +1,21 @@
 """Measure how well two judgements agree: correlations, MMRV, AUROC, accuracies, precision and recall.
 
-Correlations, MMRV and AUROC have bootstrap intervals. Shares have those of Clopper and Pearson (1934), which
-stay honest for few episodes and for shares of 0 and 1: a bootstrap would call these certain.
+All policies act in the same N scenes, so only the scenes are independent: episode n of each policy has the
+same start. Correlations, MMRV and AUROC have bootstrap intervals, which draw scenes. Shares have those of
+Clopper and Pearson (1934), for as many episodes as independent ones would tell as much (Korn and Graubard
+1998). They stay honest for few scenes and for shares of 0 and 1: a bootstrap would call these certain.
 
 M policies, N episodes, R resamples. All intervals hold 95 %.
 """
 
 import warnings
 from dataclasses import dataclass
-from functools import lru_cache
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
+from scipy.special import betaincinv
 
 from hma_model.arrays import Bools, Floats
 
@@ -55,6 +57,7 @@ class Accuracy:
         low, high: its interval, from those of both shares.
         share: the share of right ones among all.
         count, successes: judgements, and true successes among them.
+        too_few: "successes" or "failures" if so few scenes have some that no judge can pass; else empty.
     """
 
     balanced: float | None
@@ -63,19 +66,12 @@ class Accuracy:
     share: float
     count: int
     successes: int
+    too_few: str = ""
 
     @property
     def better_than_chance(self) -> bool:
         """Return whether the interval lies above 0.5, which is chance."""
         return self.low is not None and self.low > 0.5
-
-    @property
-    def too_few(self) -> str:
-        """Return "successes" or "failures" if they are so few that no judge can pass; else nothing."""
-        failures = self.count - self.successes
-        if _balanced((self.successes, failures), (self.successes, failures))[1] > 0.5:
-            return ""
-        return "successes" if self.successes <= failures else "failures"
 
     def __str__(self) -> str:
         counts = f"{self.count} episodes, {self.successes} success{'es' * (self.successes != 1)}"
@@ -125,13 +121,19 @@ def correlations(one: Floats, other: Floats, seed: int = 0) -> dict[str, Estimat
     drawn = [values[rows[:, :, None], columns[:, None]].mean(axis=-1) for values in (one, other)]
     found = {}
     for name, measure in measures.items():
-        spread = measure(*drawn)
-        # A resample in which all policies are alike has no correlation. Dropping it would keep those in which
-        # one lucky episode parts them, so it widens the interval to both sides instead.
-        low = np.percentile(np.where(np.isnan(spread), -1, spread), 100 * TAIL)
-        high = np.percentile(np.where(np.isnan(spread), 1, spread), 100 * (1 - TAIL))
-        found[name] = Estimate(float(measure(*means)), float(low), float(high))
+        found[name] = Estimate(float(measure(*means)), *_ends(measure(*drawn), -1.0, 1.0))
     return found
+
+
+def _ends(spread: Floats, least: float, most: float) -> tuple[float, float]:
+    """Return the interval of resampled figures (R,), which are NaN where there is nothing to compare.
+
+    Such a resample has all policies or outcomes alike. Dropping it would keep those in which one lucky
+    episode parts them, so it widens the interval to both sides instead.
+    """
+    low = np.percentile(np.where(np.isnan(spread), least, spread), 100 * TAIL)
+    high = np.percentile(np.where(np.isnan(spread), most, spread), 100 * (1 - TAIL))
+    return float(low), float(high)
 
 
 def rank_violation(true: ArrayLike, made: ArrayLike) -> Floats:
@@ -157,8 +159,8 @@ def mmrv(true: Floats, made: Floats, seed: int = 0) -> Estimate:
     value = float(rank_violation(true.mean(axis=1), made.mean(axis=1)))
     drawn = _drawn_episodes(true.shape[1], seed)  # sums of outcomes are exact, so equal policies stay equal
     spread = rank_violation(drawn @ true.T, drawn @ made.T) / true.shape[1]
-    low, high = np.percentile(spread, [100 * TAIL, 100 * (1 - TAIL)])
-    return Estimate(value, min(float(low), value), max(float(high), value))
+    low, high = _ends(spread, 0.0, 1.0)
+    return Estimate(value, min(low, value), max(high, value))
 
 
 def _drawn_episodes(count: int, seed: int) -> Floats:
@@ -180,65 +182,100 @@ def _too_little(*judged: Floats) -> str:
     return ""
 
 
-def accuracy(true: Bools, judged: Bools) -> Accuracy:
-    """Return how often judgements (N,) are right."""
-    right = judged == true
-    counts = float(right.mean()), true.size, int(true.sum())
-    each = int(true.sum()), int((~true).sum())
-    if not all(each):
-        return Accuracy(None, None, None, *counts)
-    return Accuracy(*_balanced((int(right[true].sum()), int(right[~true].sum())), each), *counts)
+def accuracy(true: Bools, judged: Bools, among: Bools | None = None) -> Accuracy:
+    """Return how often judgements are right: (M, N), or (N,) of independent episodes.
 
-
-def _balanced(right: tuple[int, int], each: tuple[int, int]) -> tuple[float, float, float]:
-    """Return the balanced accuracy and its interval from the right judgements of both outcomes.
-
-    The distances of two shares from the ends of their intervals add up in squares (Newcombe 1998). With the
-    ends of Clopper and Pearson, a judge that guesses, with whatever bias, passes in less than 2.5 % of cases.
-    An outcome that never came tells nothing.
+    `among` (M, N) are those that count, by default all; at least one does.
     """
-    shares = np.array([part / max(whole, 1) for part, whole in zip(right, each)])
-    ends = np.array([share_interval(part, whole) for part, whole in zip(right, each)])
-    below, above = np.sqrt(np.square(ends - shares[:, None]).sum(axis=0)) / 2
+    true, judged = np.atleast_2d(true, judged)
+    kept = np.ones_like(true) if among is None else among
+    right = judged == true
+    outcomes = {"successes": true & kept, "failures": ~true & kept}
+    scenes = {name: int(one.any(axis=0).sum()) for name, one in outcomes.items()}
+    balanced: tuple[float | None, ...] = (None, None, None)
+    if all(scenes.values()):
+        balanced = _balanced(right, *outcomes.values())
+    faultless = _balanced(kept, *outcomes.values())[1] > 0.5
+    few = "" if faultless else min(scenes, key=lambda name: scenes[name])
+    counts = float(right[kept].mean()), int(kept.sum()), int(outcomes["successes"].sum())
+    return Accuracy(*balanced, *counts, few)
+
+
+def _balanced(right: Bools, *outcomes: Bools) -> tuple[float, float, float]:
+    """Return the balanced accuracy of right judgements (M, N) of two outcomes (M, N), and its interval.
+
+    The distances of two shares from the ends of their intervals add up in squares (Newcombe 1998), and more
+    if both shares are high in the same scenes (Zou 2007). With the ends of Clopper and Pearson, a judge that
+    guesses, with whatever bias, passes in less than 2.5 % of cases. An outcome that never came tells nothing.
+    """
+    shares = np.array([(right & one).sum() / max(one.sum(), 1) for one in outcomes])
+    ends = np.array([share_interval(*independent(right & one, one)) for one in outcomes])
+    away = [(right & one).sum(axis=0) - part * one.sum(axis=0) for one, part in zip(outcomes, shares)]
+    together = np.linalg.norm(away, axis=1).prod()
+    shared = max(float(np.dot(*away) / together), 0.0) if together > 0 else 0.0
+    distances = np.abs(ends - shares[:, None])  # of both shares, by the ends
+    below, above = np.sqrt(np.square(distances).sum(axis=0) + 2 * shared * distances.prod(axis=0)) / 2
     middle = float(shares.mean())
     return middle, middle - float(below), middle + float(above)
 
 
-@lru_cache(maxsize=1024)
-def share_interval(successes: int, count: int) -> tuple[float, float]:
+def independent(hits: Bools, among: Bools) -> tuple[float, float]:
+    """Return hits (M, N) and the episodes (M, N) among which they are, as counts of independent episodes.
+
+    The counts are divided by the design effect: how much more their share varies between scenes than
+    that of independent episodes. One scene of hits and one of misses are added, so that few scenes which
+    happen to be alike are not certain. Of one policy both counts stay.
+    """
+    here = among.any(axis=0)
+    sizes, found = among.sum(axis=0)[here], (hits & among).sum(axis=0)[here]
+    if not len(sizes):
+        return 0.0, 0.0
+    size = sizes.mean()
+    of_scenes, in_scenes = np.append(sizes, [size, size]), np.append(found, [size, 0])
+    share = in_scenes.sum() / of_scenes.sum()
+    by_chance = share * (1 - share) * of_scenes.sum()
+    effect = max(float(np.square(in_scenes - share * of_scenes).sum() / by_chance), 1.0)
+    return float(found.sum()) / effect, float(sizes.sum()) / effect
+
+
+def share_interval(successes: float, count: float) -> tuple[float, float]:
     """Return Clopper and Pearson's interval of a share: the shares under which the count is no surprise."""
-    if not count:
-        return 0.0, 1.0
-    ends = stats.binomtest(successes, count).proportion_ci(1 - 2 * TAIL)
-    return float(ends.low), float(ends.high)
+    failures = count - successes
+    low = float(betaincinv(successes, failures + 1, TAIL)) if successes else 0.0
+    return low, float(betaincinv(successes + 1, failures, 1 - TAIL)) if failures else 1.0
 
 
-def precision_recall(true: Bools, judged: Bools) -> tuple[Estimate, Estimate]:
-    """Return the share of judged successes (N,) that are true, and that of true ones that are judged so."""
-    hits, said, there = int((true & judged).sum()), int(judged.sum()), int(true.sum())
+def precision_recall(true: Bools, judged: Bools, among: Bools | bool = True) -> tuple[Estimate, Estimate]:
+    """Return the share of judged successes (M, N) that are true, and that of true ones that are judged so.
 
-    def share(count: int, missing: str) -> Estimate:
-        ends = share_interval(hits, count)
-        return Estimate(hits / count, *ends) if count else Estimate(None, reason=missing)
+    `among` (M, N) are those that count, by default all.
+    """
 
-    return share(said, "nothing is judged a success"), share(there, "nothing truly succeeds")
+    def share(of: Bools, missing: str) -> Estimate:
+        kept, hits = of & among, true & judged & among
+        if not kept.any():
+            return Estimate(None, reason=missing)
+        return Estimate(int(hits.sum()) / int(kept.sum()), *share_interval(*independent(hits, kept)))
+
+    return share(judged, "nothing is judged a success"), share(true, "nothing truly succeeds")
 
 
 def auroc(true: Bools, scores: Floats, seed: int = 0) -> Estimate:
     """Return the chance that the score of a success is above that of a failure; equal scores count half.
 
-    A resample draws episodes, jointly for all policies. One without a success or a failure widens the
-    interval to both sides. Successes that all score above all failures are as certain as a share of as many.
+    A resample draws scenes, jointly for all policies. One without a success or a failure widens the
+    interval to both sides. Successes that all score above all failures are as certain as a share of as many
+    scenes.
 
     Args:
         true, scores: (M, N).
         seed: of the resamples.
     """
-    successes, failures = int(true.sum()), int((~true).sum())
+    few = min(int(one.any(axis=0).sum()) for one in (true, ~true))  # scenes with such an outcome
     count = true.shape[1]
     if count < MIN_EPISODES:
         return Estimate(None, reason=f"{count} of at least {MIN_EPISODES} episodes")
-    if not successes or not failures:
+    if not few:
         return Estimate(None, reason="all episodes have the same outcome")
     above, pairs = np.zeros((count, count)), np.zeros((count, count))  # by the episodes of both
     for success, high in zip(true, scores, strict=True):
@@ -249,11 +286,8 @@ def auroc(true: Bools, scores: Floats, seed: int = 0) -> Estimate:
     value = float(above.sum() / pairs.sum())
     drawn = _drawn_episodes(count, seed)
     compared = ((drawn @ pairs) * drawn).sum(axis=1)
-    told = compared > 0
-    spread = ((drawn @ above) * drawn).sum(axis=1) / np.where(told, compared, 1)
-    least = float(np.percentile(np.where(told, spread, 0), 100 * TAIL))
-    most = float(np.percentile(np.where(told, spread, 1), 100 * (1 - TAIL)))
-    few = min(successes, failures)
+    spread = ((drawn @ above) * drawn).sum(axis=1) / np.where(compared > 0, compared, np.nan)
+    least, most = _ends(spread, 0.0, 1.0)
     if value > 1 - 1e-12:
         least = min(least, share_interval(few, few)[0])
     if value < 1e-12:
@@ -261,15 +295,31 @@ def auroc(true: Bools, scores: Floats, seed: int = 0) -> Estimate:
     return Estimate(value, least, most)
 
 
-def episode_correlation(one: Floats, other: Floats) -> Estimate:
-    """Return how the scores (N,) of single episodes correlate, with Fisher's interval."""
-    if one.size < MIN_EPISODES:
-        return Estimate(None, reason=f"{one.size} of at least {MIN_EPISODES} episodes")
+def episode_correlation(one: Floats, other: Floats, seed: int = 0) -> Estimate:
+    """Return how the scores (M, N) of single episodes correlate.
+
+    The interval is Fisher's, with Student's t and the spread of resamples, which draw scenes jointly for all
+    policies. It is never narrower than that of independent episodes.
+    """
+    count = one.shape[1]
+    if count < MIN_EPISODES:
+        return Estimate(None, reason=f"{count} of at least {MIN_EPISODES} episodes")
     if np.ptp(one) < 1e-12 or np.ptp(other) < 1e-12:
         return Estimate(None, reason="all episodes have the same score")
-    found = stats.pearsonr(one, other)
-    ends = found.confidence_interval(1 - 2 * TAIL)
-    return Estimate(float(found.statistic), float(ends.low), float(ends.high))
+    value = float(pearson(one.ravel(), other.ravel()))
+    x, y = one - one.mean(), other - other.mean()
+    drawn = _drawn_episodes(count, seed) / one.size
+    xx, yy, xy, mean_x, mean_y = (drawn @ part.sum(axis=0) for part in (x * x, y * y, x * y, x, y))
+    spread = (xx - mean_x**2) * (yy - mean_y**2)
+    known = spread > 1e-12 * x.var() * y.var()  # else all episodes of the resample have the same score
+    if known.mean() < 1 - TAIL:
+        return Estimate(value, -1.0, 1.0)
+    resampled = (xy - mean_x * mean_y)[known] / np.sqrt(spread[known])
+    most = 1 - 1e-9  # at 1, Fisher's scale has no end
+    error = np.arctanh(resampled.clip(-most, most)).std() * np.sqrt(count / (count - 1))
+    half = stats.t.ppf(1 - TAIL, count - 1) * max(error, 1 / np.sqrt(one.size - 3))
+    middle = np.arctanh(np.clip(value, -most, most))
+    return Estimate(value, float(np.tanh(middle - half)), float(np.tanh(middle + half)))
 
 
 def alike_pairs(success: Bools) -> list[tuple[int, int]]:

@@ -21,7 +21,7 @@ import json
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import closing, nullcontext
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -115,9 +115,9 @@ class Abstention:
         """Return what is left of policies' episodes."""
         kept = meter.expected(np.stack([one.stated for one in scored])) <= max_error_px
         success = np.stack([one.success for one in scored], axis=1)
-        true, judged = success[REPLAYED][kept], success[MODEL][kept]
-        agreed = accuracy(true, judged) if kept.any() else None
-        return cls(max_error_px, int(kept.sum()), kept.size, agreed, *precision_recall(true, judged))
+        outcomes = success[REPLAYED], success[MODEL]
+        agreed = accuracy(*outcomes, kept) if kept.any() else None
+        return cls(max_error_px, int(kept.sum()), kept.size, agreed, *precision_recall(*outcomes, kept))
 
 
 @dataclass(frozen=True)
@@ -164,9 +164,7 @@ class PolicyEvaluation:
         policies can differ in the model and in the simulator for other reasons than what they did.
         """
         judged = self.generated
-        outcomes = np.stack([one.success[REPLAYED] for one in self.policies])
-        scenes = [int(part.any(axis=0).sum()) for part in (outcomes, ~outcomes)]  # policies share them
-        if few := replace(judged, count=sum(scenes), successes=scenes[0]).too_few:
+        if few := judged.too_few:
             return f"there are too few scenes with {few} to tell whether the judge is better than chance"
         if not judged.better_than_chance:
             if judged.high is not None and judged.high >= GOOD_ACCURACY:
@@ -303,9 +301,8 @@ def evaluate_policies(
         correlations(one[TRUE], one[MODEL], seed) | {"mmrv": mmrv(one[TRUE], one[MODEL], seed)}
         for one in (success.astype(float), scores)
     )
-    judged = success[MODEL].ravel()
-    replayed = success[REPLAYED].ravel()
-    precision, recall = precision_recall(success[TRUE].ravel(), judged)
+    judged, replayed = success[MODEL], success[REPLAYED]
+    precision, recall = precision_recall(success[TRUE], judged)
     return PolicyEvaluation(
         embodiment,
         str(checkpoint),
@@ -318,8 +315,8 @@ def evaluate_policies(
         by_score,
         accuracy(replayed, judged),
         *precision_recall(replayed, judged),
-        episode_correlation(scores[MODEL].ravel(), scores[REPLAYED].ravel()),
-        auroc(success[REPLAYED], scores[MODEL], seed),
+        episode_correlation(scores[MODEL], scores[REPLAYED], seed),
+        auroc(replayed, scores[MODEL], seed),
         {"precision": precision, "recall": recall, "auroc": auroc(success[TRUE], scores[MODEL], seed)},
         None if meter is None or max_error is None else Abstention.of(meter, max_error, scored),
     )

@@ -83,8 +83,8 @@ def test_accuracy_counts_successes_and_failures_alike() -> None:
 @pytest.mark.parametrize("says_success", [0.05, 0.15, 0.5])
 def test_a_judge_that_guesses_hardly_ever_passes(count: int, says_success: float) -> None:
     """However few the successes; it need not be a fair coin."""
-    rng, draws = np.random.default_rng(0), 400
-    for successes in (1, 2, 3, 5, 8, 12, 24):
+    rng, draws = np.random.default_rng(0), 200
+    for successes in (1, 3, 8, 24):
         true = np.arange(count) < successes
         passed = [accuracy(true, rng.random(count) < says_success).better_than_chance for _ in range(draws)]
         assert np.mean(passed) <= 0.05, successes
@@ -103,24 +103,87 @@ def test_successes_or_failures_too_few_for_any_judge_are_said() -> None:
 def test_precision_and_recall_have_intervals() -> None:
     true, judged = np.zeros(96, bool), np.zeros(96, bool)
     true[:30], judged[10:51] = True, True
-    precision, recall = precision_recall(true, judged)
+    precision, recall = precision_recall(true[None], judged[None])
     assert (precision.value, recall.value) == (pytest.approx(20 / 41), pytest.approx(20 / 30))
     assert precision.low == pytest.approx(0.329, abs=1e-3) and precision.high == pytest.approx(
         0.649, abs=1e-3
     )
-    nothing, none = precision_recall(true & False, judged & False)
+    nothing, none = precision_recall(true[None] & False, judged[None] & False)
     assert nothing.value is None and none.value is None and "nothing truly succeeds" in none.reason
 
 
 def test_scores_of_episodes_correlate_with_an_interval() -> None:
     rng = np.random.default_rng(0)
-    one = rng.random(96)
+    one = rng.random((1, 96))
     found, chance = (
-        episode_correlation(one, one + 0.2 * rng.random(96)),
-        episode_correlation(one, rng.random(96)),
+        episode_correlation(one, one + 0.2 * rng.random((1, 96))),
+        episode_correlation(one, rng.random((1, 96))),
     )
     assert found.low is not None and found.low > 0.8 and chance.low is not None and chance.low < 0
-    assert episode_correlation(one, np.ones(96)).reason and episode_correlation(one[:7], one[:7]).reason
+    assert episode_correlation(one, one * 0).reason and episode_correlation(one[:, :7], one[:, :7]).reason
+    alone = np.zeros((1, 96))
+    alone[0, 0] = 1  # most resamples lack this episode, and all their scores are equal
+    rare = episode_correlation(alone, alone)
+    assert (rare.value, rare.low, rare.high) == (pytest.approx(1), -1, 1)
+
+
+def of_scenes(rng: np.random.Generator, policies: int, scenes: int, rate: float) -> np.ndarray:
+    """Return outcomes (M, N) of which four in five are those of their scene, and the others are drawn."""
+    own = rng.random((policies, scenes)) < 0.2
+    return np.where(own, rng.random((policies, scenes)), rng.random(scenes)) < rate
+
+
+def test_intervals_of_shares_and_scores_resample_the_scenes_with_all_their_policies() -> None:
+    """Against a bootstrap in plain loops that draws whole scenes."""
+    rng = np.random.default_rng(2)
+    true = of_scenes(rng, 7, 100, 0.4)
+    judged = true ^ of_scenes(rng, 7, 100, 0.2)
+    scores = judged + rng.normal(0, 0.5, (1, 100)) + rng.normal(0, 0.2, (7, 100))
+    again = true + rng.normal(0, 0.2, (7, 100))
+    drawn: dict[str, list[float]] = {"accuracy": [], "precision": [], "recall": [], "correlation": []}
+    for _ in range(1000):
+        scenes = rng.integers(100, size=100)
+        one, other = true[:, scenes].ravel(), judged[:, scenes].ravel()
+        drawn["accuracy"].append((other[one].mean() + (~other[~one]).mean()) / 2)
+        drawn["precision"].append(one[other].mean())
+        drawn["recall"].append(other[one].mean())
+        drawn["correlation"].append(np.corrcoef(scores[:, scenes].ravel(), again[:, scenes].ravel())[0, 1])
+    found = [accuracy(true, judged), *precision_recall(true, judged), episode_correlation(scores, again)]
+    for estimate, (name, values) in zip(found, drawn.items(), strict=True):
+        wanted = np.percentile(values, [2.5, 97.5])
+        np.testing.assert_allclose((estimate.low, estimate.high), wanted, atol=0.02, err_msg=name)
+    one, other = accuracy(true.ravel(), judged.ravel()), accuracy(true, judged)
+    assert one.balanced == other.balanced and other.high - other.low > 1.5 * (one.high - one.low)
+
+
+@pytest.mark.parametrize("scenes", [16, 32])
+def test_policies_that_all_do_the_same_tell_no_more_than_one(scenes: int) -> None:
+    rng = np.random.default_rng(scenes)
+    true, judged = of_scenes(rng, 1, scenes, 0.4), of_scenes(rng, 1, scenes, 0.5)
+    alone, same = accuracy(true, judged), accuracy(true.repeat(8, axis=0), judged.repeat(8, axis=0))
+    assert (same.low, same.high) == pytest.approx((alone.low, alone.high))
+    assert (alone.low, alone.high) == pytest.approx((accuracy(true[0], judged[0]).low, alone.high))
+    some = np.arange(8 * 8).reshape(8, 8) % 8 < 1  # one scene of eight, without a fault
+    for truth in (some, ~some):
+        faultless = accuracy(truth, truth)
+        assert faultless.too_few and not faultless.better_than_chance
+        for one in precision_recall(truth, truth):
+            assert one.low == pytest.approx(share_interval(*[truth.any(axis=0).sum()] * 2)[0])
+    half = np.tile(np.arange(24) < 12, (8, 1))
+    assert auroc(half, half * 1.0).low == pytest.approx(share_interval(12, 12)[0])
+
+
+def test_an_interval_of_several_policies_holds_the_true_accuracy_as_often_as_it_says() -> None:
+    rng, draws = np.random.default_rng(0), 200
+    for wrong in (0.05, 0.5):
+        held, passed = 0, 0
+        for _ in range(draws):
+            true = of_scenes(rng, 6, 24, 0.4)
+            found = accuracy(true, true ^ of_scenes(rng, 6, 24, wrong))
+            held += found.balanced is None or found.low <= 1 - wrong <= found.high
+            passed += found.better_than_chance
+        assert held >= 0.92 * draws, wrong  # 0.6 of them, were the policies independent
+        assert wrong < 0.5 or passed <= 0.05 * draws
 
 
 def test_only_episodes_with_different_outcomes_tell_policies_apart() -> None:
@@ -184,7 +247,7 @@ def test_every_measure_is_what_plain_loops_compute(both: tuple[np.ndarray, np.nd
     else:
         assert area.value == pytest.approx(area_by_hand(true.ravel().tolist(), other.ravel().tolist()))
         assert 0 <= area.low <= area.high <= 1
-    precision, recall = precision_recall(true.ravel(), other.ravel() > 0)
+    precision, recall = precision_recall(true, other > 0)
     hits = sum(a and b > 0 for a, b in zip(true.ravel().tolist(), other.ravel().tolist(), strict=True))
     if precision.value is not None:
         assert precision.value == hits / sum(b > 0 for b in other.ravel().tolist())
