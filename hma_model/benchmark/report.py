@@ -1,5 +1,9 @@
-"""Show results of the benchmark: as a table for a model card, as a page, and two of them compared."""
+"""Read results of the benchmark, and show them: a table for a model card, a page, and two compared."""
 
+import hashlib
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -8,13 +12,13 @@ import numpy as np
 from hma_data.errors import OutputError, UsageError
 from hma_data.storage.files import write_atomic
 from hma_data.tables import Table
-from hma_model.benchmark import run
-from hma_model.benchmark.run import NAME, RESULTS
 from hma_model.evaluation.intervals import interval, rounded
 from hma_model.evaluation.pages import Page
 from hma_model.evaluation.plots import COLOURS, MARKERS, label_axes, svg_bytes
 from hma_model.evaluation.tables import value
 
+NAME, RESULTS = "hma-benchmark", "benchmark.json"
+REMEDY = f"give the {RESULTS} of a finished hma benchmark; delete a damaged one to measure again"
 CARD, PAGE = "benchmark.md", "benchmark.html"
 COLUMNS = ("robot", "measure", "value (95 % interval)", "reference")
 PLAIN = (  # key of a robot's figures, measure, key or text of the reference, its name
@@ -83,8 +87,6 @@ def rows(found: dict[str, Any]) -> list[list[str]]:
         for path, measure in AGREEMENT:
             number, ends, reason = agreement(policies, path)
             made.append([robot, measure, _absent(reason) if number is None else _shown(number, ends), ""])
-        if said := policies.get("refused"):
-            made.append([robot, "policies: verdict", f"none: {said}", ""])
     return made
 
 
@@ -97,6 +99,8 @@ def agreement(policies: dict[str, Any], path: str) -> tuple[float | None, list[f
     """Return a measure of hma policy-eval, its interval, and why it is absent."""
     if "missing" in policies:
         return None, None, policies["missing"]
+    if policies.get("refused") and path.startswith("correlation"):
+        return None, None, policies["refused"]  # as hma policy-eval shows none then
     found = value(policies, path)
     ends = None if found["low"] is None else [found["low"], found["high"]]
     return found["value"], ends, found["reason"]
@@ -126,6 +130,15 @@ def title(found: dict[str, Any]) -> str:
 
 def write_report(found: dict[str, Any], folder: Path) -> Path:
     """Write the table for the model card and the page beside the results; return the path of the page."""
+    with _whole(folder / RESULTS):  # results that were finished before may be edited
+        table, page = _shown_whole(found)
+    write_atomic(folder / CARD, table)
+    write_atomic(folder / PAGE, page)
+    return folder / PAGE
+
+
+def _shown_whole(found: dict[str, Any]) -> tuple[str, str]:
+    """Return the table for the model card, and the page."""
     table = Table(COLUMNS, rows(found))
     lead = (
         f"{found['checkpoint']} by {title(found)}: {found['scenes']} scenes of {found['frames']} frames, and "
@@ -142,9 +155,7 @@ def write_report(found: dict[str, Any], folder: Path) -> Path:
         cells = [[frame, signal, error] for frame, (signal, error) in enumerate(by_frame, 1)]
         page.table(("frame", "PSNR, dB", "state error, px"), cells)
         _calibration(page, one["calibration"])
-    write_atomic(folder / CARD, f"{lead}.\n\n{table.markdown()}\n")
-    write_atomic(folder / PAGE, page.html())
-    return folder / PAGE
+    return f"{lead}.\n\n{table.markdown()}\n", page.html()
 
 
 def _calibration(page: Page, found: dict[str, Any]) -> None:
@@ -197,12 +208,34 @@ def read_results(path: Path) -> dict[str, Any]:
         OutputError: there is none, or it is damaged.
     """
     path = path / RESULTS if path.is_dir() else path
-    found = run.read_results(path)
     try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        if found["benchmark"] != NAME:
+            raise ValueError
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
+        raise OutputError(path, "holds no results of the benchmark", REMEDY) from None
+    if found.pop("sha256", None) not in (None, digest(found)):  # results of older versions have none
+        raise OutputError(path, "is damaged or edited: its SHA-256 does not match", REMEDY)
+    with _whole(path):
         compared(found, found)
-    except (ArithmeticError, LookupError, TypeError, ValueError, AttributeError) as fault:
-        raise OutputError(path, f"lacks figures ({type(fault).__name__}: {fault})", run.REMEDY) from fault
+        for figures in found["by_scene"].values():
+            if wrong := [key for key, values in figures.items() if len(values) != found["scenes"]]:
+                raise ValueError(f"{wrong[0]} is not of {found['scenes']} scenes")
     return found
+
+
+def digest(found: dict[str, Any]) -> str:
+    """Return the SHA-256 of results."""
+    return hashlib.sha256(json.dumps(found).encode()).hexdigest()
+
+
+@contextmanager
+def _whole(path: Path) -> Iterator[None]:
+    """Raise OutputError where the results of a file lack what is done with them."""
+    try:
+        yield
+    except (ArithmeticError, LookupError, TypeError, ValueError, AttributeError) as fault:
+        raise OutputError(path, f"lacks figures ({type(fault).__name__}: {fault})", REMEDY) from fault
 
 
 def compared(one: dict[str, Any], other: dict[str, Any]) -> Table:

@@ -7,12 +7,10 @@ The protocol has a name and a version. A change of what is measured makes anothe
 version may be compared.
 """
 
-import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,6 +32,7 @@ from hma_model.benchmark.measures import (
     turn_back,
 )
 from hma_model.benchmark.planning import WAYS, planning_figures, reached
+from hma_model.benchmark.report import NAME, RESULTS, digest, read_results
 from hma_model.checkpoint.io import record_locally
 from hma_model.evaluation.calibration import calibration
 from hma_model.evaluation.intervals import NATURAL, rounded, summary
@@ -47,9 +46,8 @@ from hma_model.policies.scores import evaluate_policies
 from hma_model.policies.scripted import Scripted
 from hma_model.worlds.world import World, load_world
 
-NAME, VERSION = "hma-benchmark", 2
-WORK, RESULTS = ".benchmark", "benchmark.json"
-REMEDY = f"give the {RESULTS} of a finished hma benchmark; delete a damaged one to measure again"
+VERSION = 2
+WORK = ".benchmark"
 NOISE = 0.5  # share of random chunks in the action sequences of a choice
 Progress = Callable[[float, str], None]
 
@@ -137,33 +135,12 @@ def benchmark(
                 made[robot], by_scene[robot], by_frame[robot] = one.measured()
             found = facts | {"checkpoint": str(checkpoint), "measures": made}
             found |= {"by_scene": by_scene, "by_frame": by_frame}
-            write_atomic(folder / RESULTS, json.dumps(found | {"sha256": _digest(found)}, indent=1))
+            write_atomic(folder / RESULTS, json.dumps(found | {"sha256": digest(found)}, indent=1))
         remove_kept(folder / WORK)  # of a job killed here, too
         for robot, measured in found["measures"].items():
             if meter := measured["calibration"].get("meter"):  # for other commands
                 record_locally(checkpoint, world.model.source, robot, meter, "meter")
     return found
-
-
-def read_results(path: Path) -> dict[str, Any]:
-    """Return the results in benchmark.json.
-
-    Raises:
-        OutputError: it is missing or damaged.
-    """
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        if found["benchmark"] != NAME:
-            raise ValueError
-    except (OSError, ValueError, TypeError, KeyError, RecursionError):
-        raise OutputError(path, "holds no results of the benchmark", REMEDY) from None
-    if found.pop("sha256", None) not in (None, _digest(found)):  # results of older versions have none
-        raise OutputError(path, "is damaged or edited: its SHA-256 does not match", REMEDY)
-    return found
-
-
-def _digest(found: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(found).encode()).hexdigest()
 
 
 @dataclass

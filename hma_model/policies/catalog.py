@@ -11,11 +11,12 @@ import numpy as np
 
 from hma_data.errors import HMAError, UsageError
 from hma_data.lab import FAMILY
+from hma_model.policies import acting, planning
 from hma_model.policies.acting import read_acting
 from hma_model.policies.arenas import Scenes
-from hma_model.policies.base import Policy
+from hma_model.policies.base import Policy, split_options
 from hma_model.policies.lerobot import LeRobotPolicy
-from hma_model.policies.planning import read_planning
+from hma_model.policies.planning import Planning, read_planning
 from hma_model.policies.scripted import Called, Random, Scripted, Still
 from hma_model.worlds.world import World
 
@@ -51,14 +52,42 @@ def read_policy(words: str | tuple[str, Policy], scenes: Scenes, world: World | 
     if kind in ("scripted", "reach"):
         if kind == "reach" and not FAMILY.fullmatch(scenes.name):
             raise UsageError("policy reach", f"{scenes.name} has no driver that reaches", "give scripted")
-        match = re.fullmatch(r"(?:noise=(\d*\.?\d+|\d+\.))?", rest)
-        share = float(match.group(1) or 0) if match else np.nan
-        if not share <= 1:
-            raise UsageError("policy", f"{words!r} is unknown", f"give {kind}:noise=SHARE, from 0 to 1")
-        return Scripted(share, kind == "reach")
+        return Scripted(_noise(words), kind == "reach")
     if rest:
         return Called(_named(words), f"policy {words}")
     raise UsageError("policy", f"{words!r} is unknown", POLICY_FORMS)
+
+
+def identity(words: str) -> tuple[Any, ...]:
+    """Return a value that is the same for all spellings of one policy.
+
+    Raises:
+        UsageError: its options are unknown.
+    """
+    kind, _, rest = words.partition(":")
+    options: dict[str, Any] = {}
+    if kind in ("scripted", "reach"):
+        share = _noise(words)
+        return ("random",) if share == 1 else (kind, share)
+    if kind == "hma" and rest:
+        rest, given = split_options(kind, rest, acting.OPTIONS)
+        options = {"horizon": 1} | given
+    if kind == "plan" and rest:
+        rest, given = split_options(kind, rest, planning.OPTIONS)
+        options = Planning.__init__.__kwdefaults__ | given
+    if kind in ("hma", "lerobot") and rest and Path(rest).exists():
+        rest = str(Path(rest).resolve())
+    return (kind, rest, *sorted(options.items())) if rest else (kind,)
+
+
+def _noise(words: str) -> float:
+    """Return the share of random chunks in `scripted:noise=SHARE` or `reach:noise=SHARE`."""
+    kind, _, rest = words.partition(":")
+    match = re.fullmatch(r"(?:noise=(\d*\.?\d+|\d+\.))?", rest)
+    share = float(match.group(1) or 0) if match else np.nan
+    if not share <= 1:
+        raise UsageError("policy", f"{words!r} is unknown", f"give {kind}:noise=SHARE, from 0 to 1")
+    return share
 
 
 def _named(words: str) -> Any:

@@ -51,7 +51,7 @@ from hma_model.evaluation.intervals import rounded
 from hma_model.generation.commands import OutsideRangeWarning
 from hma_model.policies.arenas import Arena, ModelArena, Scenes, TrueArena
 from hma_model.policies.base import Judged, Policy, begin, checked, kept_randomness, seed_samplers
-from hma_model.policies.catalog import read_policy
+from hma_model.policies.catalog import identity, read_policy
 from hma_model.policies.fingerprints import (
     device_facts,
     object_sha256,
@@ -337,12 +337,20 @@ def choosing_meter(world: World, embodiment: str) -> Meter:
 
 
 def names_of(policies: Sequence[str | tuple[str, Policy]]) -> list[str]:
-    """Return the names of policies; raise UsageError if there is none, or one is given twice."""
+    """Return the names of policies; raise UsageError if there is none, or one is given twice.
+
+    A policy that counts twice would make correlations look better founded than they are.
+    """
     if not policies:
         raise UsageError("policies", "none is given", "give at least one; a correlation takes three")
     names = [one if isinstance(one, str) else one[0] for one in policies]
-    if twice := next((name for name in names if names.count(name) > 1), None):
-        raise UsageError(f"policy {twice}", "is given twice", "give each once")
+    seen: dict[Any, str] = {}
+    for name, one in zip(names, policies, strict=True):
+        known = (name, identity(name)) if isinstance(one, str) else (name,)
+        if first := next((seen[key] for key in known if key in seen), ""):
+            fault = "is given twice" if first == name else f"is the same policy as {first}"
+            raise UsageError(f"policy {name}", fault, "give each once")
+        seen |= dict.fromkeys(known, name)
     return names
 
 

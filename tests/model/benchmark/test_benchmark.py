@@ -202,6 +202,7 @@ def test_the_card_the_page_and_a_comparison(folders, tmp_path, capsys) -> None:
         assert "hma-benchmark 2, quick" in page.read_text()
         card = (folder / "benchmark.md").read_text()
         assert card.count("\n| ") == len(rows(found)) + 2 and "share of right choices among 5" in card
+        assert card.count("not measured: there are too few scenes with ") == 3  # correlations have no verdict
         assert "not measured: 3 of at least 8 episodes" in card
     one, other = map(read_results, folders)
     table = {row[1]: row[2:] for row in compared(one, other).rows}
@@ -237,6 +238,21 @@ def test_damaged_results_are_refused_with_what_to_do(folders: tuple[Path, Path],
         path.write_text(json.dumps(without | {"measures": dict.fromkeys(without["measures"], figures)}))
         with pytest.raises(OutputError, match="lacks figures"):
             read_results(path)
+    for scenes in ([1.0], [1.0, 2.0, 3.0, 4.0], [], 7, {"a": 1}):
+        edited: dict[str, Any] = json.loads(whole) | {"sha256": None}
+        edited["by_scene"][ROBOT]["psnr"] = scenes
+        path.write_text(json.dumps(edited))
+        assert main(["benchmark", "--compare", str(folders[0]), str(path)]) == 1
+        with pytest.raises(OutputError, match="benchmark.json: lacks figures"):
+            read_results(path)
+    for key in ("by_scene", "measures", "checkpoint", "scenes"):
+        path.write_text(json.dumps({k: v for k, v in json.loads(whole).items() if k not in (key, "sha256")}))
+        with pytest.raises(OutputError, match="benchmark.json: (lacks figures|holds the results of other)"):
+            benchmark("it", tmp_path, TINY, world=world_of(FlawlessWorld))
+    edited = json.loads(whole)
+    del edited["measures"][ROBOT]["psnr_by_frame"], edited["sha256"]
+    with pytest.raises(OutputError, match="lacks figures .*psnr_by_frame"):
+        write_report(edited, tmp_path)
 
 
 def test_finished_results_of_a_killed_job_still_record_meters_and_remove_its_parts(

@@ -467,6 +467,30 @@ def test_a_module_or_policy_that_exits_is_an_error(world: World, tmp_path: Path,
         checked("it", policy, arena)
 
 
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("scripted", "scripted:noise=0"),
+        ("scripted:noise=.5", "scripted:noise=0.50"),
+        ("random", "scripted:noise=1"),
+        ("hma:model", "hma:./model,horizon=1"),
+        ("lerobot:model", "lerobot:model/"),
+        ("plan:cem,steps=3,horizon=6", "plan:cem"),
+        ("still", "still"),
+    ],
+)
+def test_two_spellings_of_one_policy_are_refused(one: str, other: str, tmp_path, monkeypatch) -> None:
+    (tmp_path / "model").mkdir()
+    monkeypatch.chdir(tmp_path)
+    said = "is given twice" if one == other else f"is the same policy as {one}"
+    with pytest.raises(UsageError, match=f"policy {re.escape(other)}: {re.escape(said)} — give each once"):
+        scores.names_of(["scripted:noise=0.3", one, other])
+    told = ["scripted", "reach", "scripted:noise=0.1", "hma:model,horizon=2", "hma:model", "plan:mppi"]
+    assert scores.names_of([*told, ("mine", Still())]) == [*told, "mine"]
+    with pytest.raises(UsageError, match="policy reach: is given twice"):
+        scores.names_of([*told, ("reach", Still())])
+
+
 @pytest.mark.parametrize("words", ["fly", "scripted:noise=2", "scripted:speed=1"])
 def test_words_that_are_no_policy_are_refused(world: World, words: str) -> None:
     with pytest.raises(UsageError, match="is unknown"):
