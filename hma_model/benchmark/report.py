@@ -73,47 +73,29 @@ AGREEMENT = (  # path in the results of hma policy-eval, measure
 
 def rows(found: dict[str, Any]) -> list[list[str]]:
     """Return a row of COLUMNS for each measure of each robot."""
-    made = []
-    for robot, one in found["measures"].items():
-        for key, measure, reference, about in PLAIN:
-            number, ends = figure(one, key)
-            if number is None and "." in key:
-                part = one.get(key.split(".")[0], {})
-                made.append([robot, measure, _absent(part.get("missing") or ABSENT[key]), ""])
-                continue
-            beside = figure(one, reference)[0] if reference else None
-            made.append([robot, measure, _shown(number, ends), _beside(beside, about)])
-        policies = one["policies"]
-        for path, measure in AGREEMENT:
-            number, ends, reason = agreement(policies, path)
-            made.append([robot, measure, _absent(reason) if number is None else _shown(number, ends), ""])
-    return made
+    return [[robot, *row] for robot, one in found["measures"].items() for _, *row in _measures(one)]
 
 
-def figure(one: dict[str, Any], key: str) -> tuple[Any, list[float] | None]:
-    """Return a figure of a robot by its key, such as `inverse.return_px`, and its interval."""
-    return value(one, key), value(one, f"{key}_95")
-
-
-def agreement(policies: dict[str, Any], path: str) -> tuple[float | None, list[float] | None, str]:
-    """Return a measure of hma policy-eval, its interval, and why it is absent."""
-    if "missing" in policies:
-        return None, None, policies["missing"]
-    if policies.get("refused") and path.startswith("correlation"):
-        return None, None, policies["refused"]  # as hma policy-eval shows none then
-    found = value(policies, path)
-    ends = None if found["low"] is None else [found["low"], found["high"]]
-    return found["value"], ends, found["reason"]
-
-
-def _beside(reference: float | str | None, about: str) -> str:
-    if reference is None:
-        return ""
-    return about.format(reference) if isinstance(reference, str) else f"{reference:.2f} {about}"
-
-
-def _absent(reason: str) -> str:
-    return f"not measured: {reason}"
+def _measures(one: dict[str, Any]) -> Iterator[tuple[str, str, str, str]]:
+    """Yield the key of each measure of a robot, its name, its figure in words, and its reference."""
+    for key, measure, reference, about in PLAIN:
+        number = value(one, key)
+        if number is None and "." in key:
+            part = one.get(key.split(".")[0], {})
+            yield key, measure, f"not measured: {part.get('missing') or ABSENT[key]}", ""
+            continue
+        beside = value(one, reference) if reference else None
+        if beside is not None:
+            about = about.format(beside) if isinstance(beside, str) else f"{beside:.2f} {about}"
+        yield key, measure, _shown(number, value(one, f"{key}_95")), "" if beside is None else about
+    policies = one["policies"]
+    for path, measure in AGREEMENT:
+        found = value(policies, path) or {}
+        reason = policies.get("missing") or found["reason"]
+        if policies.get("refused") and path.startswith("correlation"):
+            reason = policies["refused"]  # as hma policy-eval shows none then
+        ends = None if found.get("low") is None else [found["low"], found["high"]]
+        yield path, measure, f"not measured: {reason}" if reason else _shown(found["value"], ends), ""
 
 
 def _shown(number: float | None, ends: list[float] | None) -> str:
@@ -253,15 +235,11 @@ def compared(one: dict[str, Any], other: dict[str, Any]) -> Table:
         raise UsageError("--compare", "the results share no robot", "give checkpoints with common robots")
     made = []
     for robot in robots:
-        pair = [result["measures"][robot] for result in (one, other)]
+        both = [_measures(result["measures"][robot]) for result in (one, other)]
         scenes = [result["by_scene"][robot] for result in (one, other)]
-        for key, measure, *_ in PLAIN:
-            figures = [figure(each, key) for each in pair]
-            values = [each.get(key) for each in scenes]
-            made.append([robot, measure, *(_shown(*each) for each in figures), _difference(*values)])
-        for path, measure in AGREEMENT:
-            both = [_shown(*agreement(each["policies"], path)[:2]) for each in pair]
-            made.append([robot, measure, *both, ""])
+        for (key, measure, first, _), (_, _, second, _) in zip(*both, strict=True):
+            change = _difference(*(each.get(key) for each in scenes))
+            made.append([robot, measure, first, second, change])
     return Table(("robot", "measure", one["checkpoint"], other["checkpoint"], "second − first"), made)
 
 
