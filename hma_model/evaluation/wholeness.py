@@ -66,34 +66,28 @@ def continued(
     return Found(robot, true[:, begin:], made.predicted[:, begin:], parts[:, begin:], episodes[0].driven)
 
 
-def colors_of(found: Found) -> Floats:
-    """Return the colour (P, 3) of each part: the commonest at its place in the true frames."""
+def palettes(found: Found) -> tuple[Floats, Floats]:
+    """Return the colours of the robot's own parts and of loose objects, (C, 3) each.
+
+    The colour of a part is the commonest at its place in the true frames.
+    """
     side, count = found.true.shape[2], found.parts.shape[2]
     places = np.clip((found.parts * side / truth.SIZE).astype(int), 0, side - 1)
     b, t = np.ogrid[: found.true.shape[0], : found.true.shape[1]]
     taken = [found.true[b, t, places[:, :, p, 1], places[:, :, p, 0]].reshape(-1, 3) for p in range(count)]
-    return np.stack([np.median(pixels, axis=0) for pixels in taken])
-
-
-def distinct(colors: Floats) -> Floats:
-    """Return the colours (C, 3) without those near an earlier one: places of one object differ a little."""
-    kept: list[Floats] = []
-    for color in colors:
+    own, loose = list[Floats](), list[Floats]()
+    for part, pixels in enumerate(taken):
+        color, kept = np.median(pixels, axis=0), own if part < found.driven else loose
+        # places of one object differ a little
         if all(np.linalg.norm(color - other) >= NEAR for other in kept):
             kept.append(color)
-    return np.reshape(kept, (-1, 3))
+    return np.reshape(own, (-1, 3)), np.reshape(loose, (-1, 3))
 
 
 def masks_of(images: Images, colors: Floats) -> Bools:
     """Return the pixels (C, …, S, S) that have each of the colours (C, 3) and no other one rather."""
     far = np.stack([np.linalg.norm(images.astype(np.float32) - color, axis=-1) for color in colors])
     return (far < NEAR) & (far == far.min(axis=0))
-
-
-def palettes(found: Found) -> tuple[Floats, Floats]:
-    """Return the colours of the robot's own parts and of loose objects, (C, 3) each."""
-    colors = colors_of(found)
-    return distinct(colors[: found.driven]), distinct(colors[found.driven :])
 
 
 def shares(true: Bools, made: Bools) -> Floats:
