@@ -192,7 +192,7 @@ def accuracy(true: Bools, judged: Bools, among: Bools | None = None) -> Accuracy
     right = judged == true
     outcomes = {"successes": true & kept, "failures": ~true & kept}
     scenes = {name: int(one.any(axis=0).sum()) for name, one in outcomes.items()}
-    balanced: tuple[float | None, ...] = (None, None, None)
+    balanced: tuple[float | None, float | None, float | None] = None, None, None
     if all(scenes.values()):
         balanced = _balanced(right, *outcomes.values())
     faultless = _balanced(kept, *outcomes.values())[1] > 0.5
@@ -212,7 +212,7 @@ def _balanced(right: Bools, *outcomes: Bools) -> tuple[float, float, float]:
     ends = np.array([share_interval(*independent(right & one, one)) for one in outcomes])
     away = [(right & one).sum(axis=0) - part * one.sum(axis=0) for one, part in zip(outcomes, shares)]
     together = np.linalg.norm(away, axis=1).prod()
-    shared = max(float(np.dot(*away) / together), 0.0) if together > 0 else 0.0
+    shared = max(float(np.dot(away[0], away[1]) / together), 0.0) if together > 0 else 0.0
     distances = np.abs(ends - shares[:, None])  # of both shares, by the ends
     below, above = np.sqrt(np.square(distances).sum(axis=0) + 2 * shared * distances.prod(axis=0)) / 2
     middle = float(shares.mean())
