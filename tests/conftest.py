@@ -23,7 +23,7 @@ from hma_data.tokenizers.base import TokenizerSpec, check_frames, check_tokens
 
 # The same few examples in every run, so that a red main means the change; HMA_FUZZ=1 draws many new ones.
 ALWAYS = {"deadline": None, "suppress_health_check": [HealthCheck.function_scoped_fixture]}
-settings.register_profile("same", derandomize=True, database=None, max_examples=30, **ALWAYS)
+settings.register_profile("same", derandomize=True, database=None, max_examples=20, **ALWAYS)
 settings.register_profile("new", print_blob=True, max_examples=200, **ALWAYS)
 settings.load_profile("new" if os.environ.get("HMA_FUZZ") else "same")
 

@@ -179,7 +179,7 @@ def test_hma_convert_prints_one_line_and_again_when_it_keeps_all_shards(tmp_path
     path, out = timed(tmp_path, [5, 5, 5]), tmp_path / "out"
     (tmp_path / "toy_arm.yaml").write_text(TIMED_YAML)
     args = ["convert", "-e", tmp_path / "toy_arm.yaml", "--source", path, "--out", out]
-    args += ["--tokenizer", "fsq-8", "--workers", "0"]
+    args += ["--tokenizer", "raw-64", "--workers", "0"]
     for _ in range(2):
         done = hma(*args)
         lines = [line for line in done.stderr.splitlines() if line.startswith("warning: ")]

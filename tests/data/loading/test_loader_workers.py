@@ -46,8 +46,7 @@ def windows_of(batch: Batch) -> list[tuple[str, int, int]]:
     return list(zip(batch.embodiment, batch.episode.tolist(), batch.frame.tolist(), strict=True))
 
 
-@pytest.mark.parametrize("workers", [1, 2, 3, 9])
-@pytest.mark.parametrize("begun", [0, 3])
+@pytest.mark.parametrize(("workers", "begun"), [(1, 3), (2, 0), (3, 3), (9, 0)])
 def test_any_number_of_workers_gives_the_same_batches(sets: list[Path], workers: int, begun: int) -> None:
     data, alone = dataset(sets, lanes=3), dataset(sets, lanes=3)
     assert seen(iter(data), begun) == seen(iter(alone), begun)
@@ -202,8 +201,7 @@ def stateful(sets: list[Path], workers: int) -> Any:
     )
 
 
-@pytest.mark.parametrize("workers", [0, 1, 3])
-@pytest.mark.parametrize("stop", [1, 4, 9])
+@pytest.mark.parametrize(("workers", "stop"), [(0, 4), (1, 9), (3, 1), (3, 4)])
 def test_torchdatas_loader_saves_and_goes_on(sets: list[Path], workers: int, stop: int) -> None:
     whole = seen(iter(dataset(sets)), 16)
     first = stateful(sets, workers)

@@ -46,7 +46,7 @@ def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
     yaml.write_text(Checkpoint.open("embedded").embodiment(RAILS).to_yaml())
     source = str(record(RAILS, folder, 2))
     words = ["convert", "-e", str(yaml), "--source", source, "--tokenizer", "fsq-lab", "--out"]
-    assert main([*words, str(folder / "shards"), "--workers", "1"]) == 0
+    assert main([*words, str(folder / "shards"), "--workers", "0"]) == 0
     return folder / "shards"
 
 
