@@ -1,12 +1,17 @@
 """Recordings of a robot with three cameras of three sizes; colours tell camera, episode and frame."""
 
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 
+from hma_data.conversion.job import convert
+from hma_data.conversion.plan import Settings
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.lerobot.writer import LeRobotEpisode, write_lerobot
+from hma_data.tokenizers.base import Tokenizer
+from tests.conftest import BlockTokenizer
 
 SIZES = {"top": (64, 64), "wrist": (32, 32), "side": (64, 96)}
 LENGTHS = (9, 8, 10)
@@ -46,6 +51,14 @@ def write_hdf5(path: Path) -> Path:
             for camera in SIZES:
                 group[f"obs/{camera}"] = pictures(camera, episode, length)
     return path
+
+
+def three_shards(folder: Path, tokenizer: Tokenizer | None = None, **chosen: Any) -> Path:
+    """Convert such a recording with all its cameras into a folder here, and return that folder."""
+    settings = Settings(cameras=("all",), **chosen)
+    recording = write_hdf5(folder / "three.hdf5")
+    convert(arm(), recording, tokenizer or BlockTokenizer(), folder / "set", settings=settings)
+    return folder / "set"
 
 
 def write_dataset(folder: Path) -> Path:

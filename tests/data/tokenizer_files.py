@@ -83,6 +83,11 @@ def write_magvit2(path: Path, config: Magvit2Config = TINY_MAGVIT2, seed: int = 
     return path
 
 
+def altered(state: dict[str, Tensor], changes: dict[str, Tensor | None]) -> dict[str, Tensor]:
+    """Return weights of which some are replaced, or left out where None."""
+    return {name: tensor for name, tensor in {**state, **changes}.items() if tensor is not None}
+
+
 def tiny_halves(
     channels: int = 4, width: int = 8, pooled: int = 0, seed: int = 0, scales: int = 3
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:

@@ -82,15 +82,6 @@ def test_same_seed_gives_the_same_episode(robot: str) -> None:
 
 
 @pytest.mark.parametrize("robot", EVERY)
-def test_recorded_commands_make_the_recorded_pictures(robot: str) -> None:
-    demo = episode(Body.of(robot), SEED, 2)
-    world, _ = start(Body.of(robot), SEED, 2)
-    for picture, command in zip(demo.observations["image"], demo.actions, strict=True):
-        np.testing.assert_array_equal(world.picture(), picture)
-        world.advance(command.astype(np.float64))
-
-
-@pytest.mark.parametrize("robot", EVERY)
 def test_other_commands_make_other_pictures_and_no_command_a_still_one(robot: str) -> None:
     steps = 6 * Body.of(robot).stride
     low, high, rest = (driven(robot, command, steps)[1] for command in ("low", "high", "still"))

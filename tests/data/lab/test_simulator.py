@@ -28,8 +28,15 @@ def recorded(robot: Embodiment, folder: Path) -> tuple[Clip, NDArray[np.uint8]]:
     return clip, prepare(clip.frames_at(camera.name, np.arange(len(clip))), camera, SIZE)
 
 
+SLOW = ("pusht_fast", "arm1_02", "arm3_55", "arm4_04", "mover_10", "gantry_04", "rails_09")
+
+
 @pytest.mark.parametrize(
-    "robot", [pytest.param("pusht_fast", marks=pytest.mark.slow), "pendulum", "planar_arm", "arm2_12"]
+    "robot",
+    [
+        *("pendulum", "planar_arm", "arm2_12", "mover_52", "crane_01"),
+        *(pytest.param(robot, marks=pytest.mark.slow) for robot in SLOW),
+    ],
 )
 def test_recorded_commands_give_the_recorded_pictures_and_states(robot: str, tmp_path: Path) -> None:
     simulator = LabSimulator(robot)

@@ -90,19 +90,6 @@ def test_a_restart_goes_on_with_the_same_windows(sets: list[Path], stop: int) ->
     assert all(same(a, b) for a, b in zip(whole, begun + rest, strict=True))
 
 
-def test_ranks_see_disjoint_windows(sets: list[Path]) -> None:
-    seen = []
-    for rank in (0, 1):
-        data = MixtureDataset(sets[:1], 2, FRAMES, rank=rank, world=2, lanes=2)
-        streams = [data._sequence(lane, 0) for lane in range(2)]
-        cuts = [stream.take(0, stream.length) for stream in streams]
-        seen.append(
-            {(int(e), int(f)) for cut in cuts for e, f in zip(cut["episode"], cut["frame"], strict=True)}
-        )
-    assert not seen[0] & seen[1]
-    assert len(seen[0] | seen[1]) == data.mixture.counts[0]
-
-
 def test_ranks_share_one_draw_of_the_mixture(sets: list[Path]) -> None:
     single = [batch.embodiment for batch in islice(MixtureDataset(sets, 8, FRAMES), 5)]
     ranks = [MixtureDataset(sets, 4, FRAMES, rank=rank, world=2) for rank in (0, 1)]

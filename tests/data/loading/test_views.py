@@ -6,12 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from hma_data.conversion.job import convert
-from hma_data.conversion.plan import Settings
 from hma_data.errors import UsageError
 from hma_data.loading.dataset import MixtureDataset, WindowDataset, open_sets
-from tests.conftest import BlockTokenizer
-from tests.data.cameras import SIZES, arm, write_hdf5
+from tests.data.cameras import SIZES, three_shards
 from tests.data.conversion.test_cameras import ONE_CAMERA
 
 NAMES = list(SIZES)
@@ -20,11 +17,7 @@ FRAMES = 3
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("views")
-    recording = write_hdf5(folder / "three.hdf5")
-    settings = Settings(val_fraction=0, cameras=("all",))
-    convert(arm(), recording, BlockTokenizer(), folder / "set", settings=settings)
-    return folder / "set"
+    return three_shards(tmp_path_factory.mktemp("views"), val_fraction=0)
 
 
 def every(folder: Path, cameras: object) -> object:

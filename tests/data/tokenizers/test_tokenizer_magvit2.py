@@ -13,13 +13,20 @@ from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.errors import TokenizerError
 from hma_data.registry.embodiment import Embodiment
-from hma_data.shards.preview import preview, tokenizer_of
+from hma_data.shards.preview import tokenizer_of
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_tokenizer
 from hma_data.tokenizers.magvit2 import Magvit2, Magvit2Config, derive_config, read_network
 from tests.conftest import write_toy
-from tests.data.tokenizer_files import TINY_MAGVIT2, frames, magvit2_state, randomized, write_magvit2
+from tests.data.tokenizer_files import (
+    TINY_MAGVIT2,
+    altered,
+    frames,
+    magvit2_state,
+    randomized,
+    write_magvit2,
+)
 
 
 @pytest.fixture(scope="module")
@@ -262,36 +269,24 @@ def test_halves_are_computed_with_as_floats(tmp_path, weights, tiny):
     assert all(torch.equal(p, halves[name].float()) for name, p in network.named_parameters())
 
 
-def altered(**changes: Tensor | None) -> dict[str, Tensor]:
-    """The tiny weights with some replaced, or left out where None; double underscores are dots."""
-    state = magvit2_state()
-    for key, tensor in changes.items():
-        name = key.replace("__", ".")
-        if tensor is None:
-            del state[name]
-        else:
-            state[name] = tensor
-    return state
-
-
 @pytest.mark.parametrize(
-    ("state", "named"),
+    ("changes", "named"),
     [
-        ({"conv.weight": torch.zeros(3, 3)}, r"lacks encoder\.conv_in\.weight"),
-        (altered(decoder__conv_in__bias=None), r"Missing key.*decoder\.conv_in\.bias"),
-        (altered(encoder__conv_out__weight=None), r"lacks encoder\.conv_out\.weight"),
-        (altered(encoder__mid__attn_1__q__weight=torch.zeros(2)), r"encoder\.mid\.attn_1\.q\.weight"),
-        (altered(quant_conv__weight=torch.zeros(2)), r"quant_conv\.weight"),
-        (altered(decoder__conv_in__weight=torch.zeros(32, 4, 3, 3)), r"size mismatch for decoder\.conv_in"),
-        (altered(encoder__conv_in__weight=torch.zeros(24, 3, 3, 3)), "divisible"),
-        (altered(encoder__conv_in__weight=torch.zeros(32, 1, 3, 3)), r"size mismatch for encoder\.conv_in"),
-        (altered(encoder__conv_in__weight=torch.zeros(0, 3, 3, 3)), "does not hold the weights"),
-        (altered(encoder__conv_in__weight=torch.zeros(3)), "does not hold the weights"),
-        (altered(decoder__conv_in__bias=torch.full((32,), torch.nan)), "not finite"),
+        ({"encoder.conv_in.weight": None}, r"lacks encoder\.conv_in\.weight"),
+        ({"decoder.conv_in.bias": None}, r"Missing key.*decoder\.conv_in\.bias"),
+        ({"encoder.conv_out.weight": None}, r"lacks encoder\.conv_out\.weight"),
+        ({"encoder.mid.attn_1.q.weight": torch.zeros(2)}, r"encoder\.mid\.attn_1\.q\.weight"),
+        ({"quant_conv.weight": torch.zeros(2)}, r"quant_conv\.weight"),
+        ({"decoder.conv_in.weight": torch.zeros(32, 4, 3, 3)}, r"size mismatch for decoder\.conv_in"),
+        ({"encoder.conv_in.weight": torch.zeros(24, 3, 3, 3)}, "divisible"),
+        ({"encoder.conv_in.weight": torch.zeros(32, 1, 3, 3)}, r"size mismatch for encoder\.conv_in"),
+        ({"encoder.conv_in.weight": torch.zeros(0, 3, 3, 3)}, "does not hold the weights"),
+        ({"encoder.conv_in.weight": torch.zeros(3)}, "does not hold the weights"),
+        ({"decoder.conv_in.bias": torch.full((32,), torch.nan)}, "not finite"),
     ],
 )
-def test_weights_of_another_network_are_refused_by_name(tmp_path, state, named):
-    save_file(state, tmp_path / "other.safetensors")
+def test_weights_of_another_network_are_refused_by_name(tmp_path, changes, named):
+    save_file(altered(magvit2_state(), changes), tmp_path / "other.safetensors")
     with pytest.raises(TokenizerError, match=named) as caught:
         get_tokenizer("magvit2", weights=str(tmp_path / "other.safetensors"))
     assert "other.safetensors" in str(caught.value) and caught.value.remedy
@@ -306,27 +301,15 @@ def test_frames_and_tokens_that_do_not_fit_are_refused(tiny):
         tiny.decode(np.zeros((1, 8, 8), np.uint32))
 
 
-@pytest.mark.slow
-def test_it_makes_shards_that_verify_and_decode(toy_arm: Embodiment, tmp_path, weights, tiny):
-    write_toy(tmp_path / "toy.hdf5", [5, 4])
-    out = tmp_path / "out"
-    settings = Settings(cameras=("top",))
-    convert(toy_arm, str(tmp_path / "toy.hdf5"), "magvit2", out, weights=str(weights), settings=settings)
-    assert verify(out) == []
-    shards = ShardSet(out)
-    assert shards.spec == tiny.spec
-    rows = shards.episode_rows(0)
-    tokens = shards.tokens(rows["tokens"])
-    assert tokenizer_of(shards, str(weights)).decode(tokens).shape == (len(tokens), 256, 256, 3)
-    made = preview(out, tmp_path / "look", weights=str(weights))
-    assert made.sheet.stat().st_size and made.video.stat().st_size
-
-
-def test_shards_of_other_weights_are_not_decoded(toy_arm: Embodiment, tmp_path, weights):
+def test_its_shards_are_decoded_with_its_own_weights_alone(toy_arm: Embodiment, tmp_path, weights, tiny):
     write_toy(tmp_path / "toy.hdf5", [2])
     out = tmp_path / "out"
     settings = Settings(cameras=("top",))
     convert(toy_arm, str(tmp_path / "toy.hdf5"), "magvit2", out, weights=str(weights), settings=settings)
+    shards = ShardSet(out)
+    assert verify(out) == [] and shards.spec == tiny.spec
+    tokens = shards.tokens(shards.episode_rows(0)["tokens"])
+    assert tokenizer_of(shards, str(weights)).decode(tokens).shape == (len(tokens), 256, 256, 3)
     other = write_magvit2(tmp_path / "other.safetensors", seed=5)
     with pytest.raises(TokenizerError, match="was made by magvit2 with weights"):
-        tokenizer_of(ShardSet(out), str(other))
+        tokenizer_of(shards, str(other))

@@ -11,7 +11,7 @@ from safetensors.torch import load_file, save_file
 from hma_data.errors import MissingDependencyError, TokenizerError
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_tokenizer
 from hma_data.tokenizers.latents import derive_svd_config
-from tests.data.tokenizer_files import frames
+from tests.data.tokenizer_files import altered, frames
 
 NAME = "diffusion_pytorch_model.safetensors"
 
@@ -105,12 +105,6 @@ def test_another_scale_in_the_config_is_kept(folder, tmp_path):
     ],
 )
 def test_weights_of_another_network_are_refused_by_name(folder, tmp_path, changes, named):
-    state = load_file(folder / NAME)
-    for key, tensor in changes.items():
-        if tensor is None:
-            del state[key]
-        else:
-            state[key] = tensor
-    save_file(state, tmp_path / NAME)
+    save_file(altered(load_file(folder / NAME), changes), tmp_path / NAME)
     with pytest.raises(TokenizerError, match=named):
         get_tokenizer("svd-vae", weights=str(tmp_path))

@@ -20,7 +20,7 @@ from hma_data.shards.verify import verify
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_tokenizer
 from hma_data.tokenizers.latents import read_tiny
 from tests.conftest import write_toy
-from tests.data.tokenizer_files import frames, tiny_halves, write_tiny_pair, write_tiny_whole
+from tests.data.tokenizer_files import altered, frames, tiny_halves, write_tiny_pair, write_tiny_whole
 
 
 @pytest.fixture(scope="module")
@@ -219,13 +219,7 @@ def test_half_a_pair_is_refused(tmp_path):
     ],
 )
 def test_weights_of_another_network_are_refused_by_name(tmp_path, weights, changes, named):
-    state = load_file(weights)
-    for key, tensor in changes.items():
-        if tensor is None:
-            del state[key]
-        else:
-            state[key] = tensor
-    save_file(state, tmp_path / "other.safetensors")
+    save_file(altered(load_file(weights), changes), tmp_path / "other.safetensors")
     with pytest.raises(TokenizerError, match=named) as caught:
         get_tokenizer("taesd", weights=str(tmp_path / "other.safetensors"))
     assert "other.safetensors" in str(caught.value)

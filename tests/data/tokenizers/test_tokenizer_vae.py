@@ -81,12 +81,3 @@ def test_training_measures_the_scale_of_the_latents(tmp_path):
         [np.stack([draw_scene(np.random.default_rng(1), 256)])],
     )
     assert 0.3 < result["latent_std_scaled"] < 3
-
-
-@pytest.mark.real
-def test_real_robot_frames_come_back_as_promised(real_data, vae):
-    from hma_data.tokenizers.training.frames import read_films
-
-    video = sorted((real_data / "lerobot" / "g1_v21" / "videos").rglob("*.mp4"))[0]
-    result = evaluate(vae, read_films(video, 256, frames=4))
-    assert result["psnr_db"] >= 30 and result["ssim"] >= 0.92

@@ -268,17 +268,11 @@ def test_recorded_pictures_are_those_of_the_windows_frames(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("cameras", ["wrist", "drawn"])
 def test_recorded_pictures_are_of_the_camera_that_the_window_takes(cameras: str, tmp_path: Path) -> None:
-    from hma_data.conversion.job import convert
-    from hma_data.conversion.plan import Settings
     from hma_data.loading.dataset import WindowDataset
     from hma_data.shards.reader import ShardSet
-    from tests.conftest import BlockTokenizer
     from tests.data import cameras as three
 
-    settings = Settings(val_fraction=0, cameras=("all",))
-    recording = three.write_hdf5(tmp_path / "three.hdf5")
-    convert(three.arm(), recording, BlockTokenizer(), tmp_path / "set", settings=settings)
-    shards = ShardSet(tmp_path / "set")
+    shards = ShardSet(three.three_shards(tmp_path, val_fraction=0))
     windows = WindowDataset(shards, "train", 3, cameras=cameras)
     batch = windows.batch(range(len(windows)))
     assert batch.camera is not None

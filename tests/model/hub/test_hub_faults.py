@@ -71,23 +71,6 @@ def test_a_failed_transfer_by_xet_goes_on_by_lfs(server, source, monkeypatch):
     assert checkpoint.load(hub.pull(REPO))
 
 
-@pytest.mark.parametrize("told", [True, False])
-def test_a_commit_that_was_made_though_its_answer_was_lost_stays_alone(server, source, told):
-    server.habits.tells_oids = told
-    hub.push(source, REPO, ["arm"])
-    repository = server.model(REPO)
-    plain = repository.commit
-
-    def commit(files, message="by hand"):
-        plain(files, message)
-        repository.commit = plain
-        raise ConnectionResetError
-
-    repository.commit = commit
-    hub.push(source, REPO, ["hand"])
-    assert kinds(server) == ["Add arm", "Add hand"]
-
-
 def test_a_repository_that_is_missing_without_a_code_is_made(server, source):
     server.habits.codes = False
     hub.push(source, REPO)

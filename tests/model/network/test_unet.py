@@ -141,28 +141,16 @@ def test_what_moves_weighs_more() -> None:
     )
 
 
-def test_each_pass_makes_one_more_frame_of_the_past_that_of_a_rollout() -> None:
-    model = unet(**{**LATENTS, "frames": 6})
-    batch = small_batch(model.config, ["arm"])
-    batch.tokens, batch.latents = None, stored(model, 1, 6)
+@pytest.mark.parametrize("changes", [LATENTS, COLORS])
+def test_each_pass_makes_one_more_frame_of_the_past_that_of_a_rollout(changes: dict[str, Any]) -> None:
+    model = unet(**{**changes, "frames": 6})
+    batch, true = small_batch(model.config, ["arm"]), stored(model, 1, 6)
+    batch.tokens, batch.latents = (true, None) if model.config.kind == "discrete" else (None, true)
     seen = forwarded(model, batch, 1.0, 3, torch.Generator().manual_seed(0)).context
     assert seen is not None
-    replaced = (seen != batch.latents).flatten(2).any(-1)[0].nonzero().flatten().tolist()
-    first = replaced[0]
-    rolled = model.generate(batch.latents[:, :first], batch.actions, "arm", 3)
+    first = int((seen != true).flatten(2).any(-1)[0].nonzero()[0])
+    rolled = model.generate(true[:, :first], batch.actions, "arm", 3, unmask_steps=1, temperature=0.0)
     torch.testing.assert_close(seen[:, first : first + 3], rolled[:, : 6 - first], rtol=0, atol=1e-4)
-
-
-def test_each_pass_makes_one_more_frame_of_tokens_that_of_a_rollout() -> None:
-    model = unet(**{**COLORS, "frames": 6})
-    batch = small_batch(model.config, ["arm"])
-    batch.tokens = stored(model, 1, 6)
-    seen = forwarded(model, batch, 1.0, 3, torch.Generator().manual_seed(0)).context
-    assert seen is not None
-    first = (seen != batch.tokens).flatten(2).any(-1)[0].nonzero().flatten().tolist()[0]
-    known = batch.tokens[:, :first]
-    rolled = model.generate(known, batch.actions, "arm", 3, unmask_steps=1, temperature=0.0)
-    assert torch.equal(seen[:, first : first + 3], rolled[:, : 6 - first])
 
 
 SHADES = "ffffff8090a08494a47c8c9cff0000"  # a ground, three shades of an object, another one

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from hma_data.conversion.job import convert
-from hma_data.conversion.plan import Settings
 from hma_data.episodes.sheets import write_mp4
 from hma_data.errors import EpisodeError, HMAError, OutputError, UsageError
 from hma_data.lab import family, record
@@ -115,25 +114,6 @@ def test_labels_no_better_than_the_mean_are_refused(world: World, real: Path, tm
     with pytest.raises(HMAError, match="are no better than their mean on labelled video"):
         label_actions(real, tmp_path / "out", ROBOT, checkpoint="run", world=world, check=real)
     assert not (tmp_path / "out").exists()
-
-
-def test_film_that_pauses_is_labelled_in_parts(world: World, real: Path, tmp_path: Path) -> None:
-    paused = shutil.copytree(real, tmp_path / "paused")
-    shards, (row, *_) = ShardSet(paused), ShardSet(paused).episodes.to_pylist()
-    whole = ShardFilm(world, shards, shards.row_stride)
-    state_pauses(paused, {10: 90})
-    film = ShardFilm(world, ShardSet(paused), shards.row_stride)
-    name = row["id"]
-    assert [(episode.id, episode.group) for episode in film.episodes()][:2] == [
-        (f"{name}_from_0", row["group"] or name),
-        (f"{name}_from_11", row["group"] or name),
-    ]
-    assert len(film.episodes()) == len(whole.episodes()) + 1
-    stored, actions, known = film.labelled(0)
-    steps = -(-11 // shards.row_stride)
-    np.testing.assert_array_equal(stored, whole.labelled(0)[0][:steps])
-    assert len(actions) == steps and known.all() == (11 % shards.row_stride == 0)
-    assert len(film.stored(1)) == -(-(row["length"] - 11) // shards.row_stride)
 
 
 def film(folder: Path) -> np.ndarray:
@@ -250,10 +230,7 @@ def test_film_that_has_grown_or_changed_is_never_taken_for_what_was_labelled(
 
 @pytest.fixture(scope="module", params=[BlockTokenizer, BlockLatents])
 def three(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> ShardSet:
-    folder = tmp_path_factory.mktemp("three")
-    recording = cameras.write_hdf5(folder / "three.hdf5")
-    convert(cameras.arm(), recording, request.param(), folder / "set", settings=Settings(cameras=("all",)))
-    return ShardSet(folder / "set")
+    return ShardSet(cameras.three_shards(tmp_path_factory.mktemp("three"), request.param()))
 
 
 @pytest.mark.parametrize(
@@ -277,6 +254,21 @@ def test_film_shows_the_cameras_that_the_model_was_trained_on(three, views, seen
     frames, chunks = read_prompt(world.model, three.embodiment.id, place)
     np.testing.assert_array_equal(frames, stored[:-1])
     np.testing.assert_array_equal(chunks, film.labelled(1)[1][: len(frames) - 1])
+
+
+@pytest.mark.parametrize("three", [BlockTokenizer], indirect=True)
+def test_film_that_pauses_is_labelled_in_parts(three: ShardSet, tmp_path: Path) -> None:
+    world, row = trained_on("first", three, tmp_path / "model"), three.episodes.to_pylist()[0]
+    paused = shutil.copytree(three.folder, tmp_path / "paused")
+    state_pauses(paused, {4: 90})
+    whole, film = (ShardFilm(world, shards, 2) for shards in (three, ShardSet(paused)))
+    found = [(episode.id, episode.group) for episode in film.episodes()]
+    assert found[:2] == [(f"{row['id']}_from_{start}", row["id"]) for start in (0, 5)]
+    assert len(found) == len(whole.episodes()) + 1
+    stored, actions, known = film.labelled(0)
+    np.testing.assert_array_equal(stored, whole.labelled(0)[0][:3])
+    assert len(actions) == 3 and known.tolist() == [True, True, False]
+    assert len(film.stored(1)) == -(-(row["length"] - 5) // 2)
 
 
 @pytest.mark.parametrize("views", ["wrist", ["side", "top"]])

@@ -115,6 +115,7 @@ WRONG = [  # a recipe, and what the error says
     ("self_forwrd: 1", r"self_forwrd: unknown key, did you mean 'self_forward'\?"),
     ("mixture: {caps: {arm: .inf}}", r"mixture\.caps\.arm: .*finite"),
     ("data: [3]", r"data\.0: .*string"),
+    ("stepz: 3\nlr: fast\nmodel: {layer: 1}", r"model\.layer: .*lr: .*stepz: "),  # all at once
 ]
 
 
@@ -131,24 +132,18 @@ def test_numbers_of_the_network_may_be_written_as_yaml_reads_texts():
     assert (model["corrupt_max"], model["layers"]) == (0.1, 2) and isinstance(model["layers"], int)
 
 
-def test_what_a_recipe_extends_cannot_be_overridden():
-    with pytest.raises(RecipeError, match="extends: cannot be an override"):
-        load_recipe("discrete_tiny", ["extends=discrete_base"])
-
-
-def test_a_folder_is_no_recipe(tmp_path):
-    with pytest.raises(RecipeError, match="no such recipe"):
-        load_recipe(tmp_path)
-
-
-def test_all_problems_are_told_at_once(write):
-    with pytest.raises(RecipeError, match=r"model\.layer: .*lr: .*stepz: "):
-        load_recipe(write("broken", "stepz: 3\nlr: fast\nmodel: {layer: 1}\n"))
-
-
-def test_an_unknown_recipe_names_the_nearest():
-    with pytest.raises(RecipeError, match="did you mean 'discrete_tiny'"):
-        load_recipe("discrete_tinny")
+@pytest.mark.parametrize(
+    ("name", "overrides", "message"),
+    [
+        ("discrete_tiny", ["extends=discrete_base"], "extends: cannot be an override"),
+        (Path(__file__).parent, [], "no such recipe"),
+        ("discrete_tinny", [], "did you mean 'discrete_tiny'"),
+        ("unet_colors", ["model.crop=10", "model.patch=1"], r"model\.crop: 10 .* give 0, or a multiple of 4"),
+    ],
+)
+def test_a_recipe_or_an_override_that_cannot_be_is_named(name, overrides, message):
+    with pytest.raises(RecipeError, match=message):
+        load_recipe(name, overrides)
 
 
 def test_the_network_follows_the_shards_tokenizer():
@@ -231,11 +226,6 @@ def test_overrides_of_one_mapping_gather():
 def test_a_unet_needs_no_further_key_and_takes_either_loss(changes):
     model = {"trunk": "unet", "shared_modulation": True, "copy_previous": True} | changes
     assert make_recipe({"data": ["x"], "model": model}).model["trunk"] == "unet"
-
-
-def test_a_square_that_does_not_fit_the_levels_is_named():
-    with pytest.raises(RecipeError, match=r"model\.crop: 10 is not allowed: give 0, or a multiple of 4"):
-        load_recipe("unet_colors", ["model.crop=10", "model.patch=1"])
 
 
 # -- what is shipped

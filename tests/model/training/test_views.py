@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from hma_data.conversion.job import convert
-from hma_data.conversion.plan import Settings
 from hma_data.errors import RecipeError, UsageError
 from hma_data.shards.reader import ShardSet
 from hma_model.config import HMAConfig
@@ -18,7 +16,7 @@ from hma_model.network.model import HMA
 from hma_model.training.loop import train
 from hma_model.training.recipe import make_recipe
 from tests.conftest import BlockTokenizer
-from tests.data.cameras import SIZES, arm, write_hdf5
+from tests.data.cameras import SIZES, arm, three_shards
 from tests.model.runs import TINY
 
 NAMES = list(SIZES)
@@ -27,11 +25,7 @@ SHORT = TINY | {"steps": 2, "frames": 3, "batch_size": 2, "eval_windows": 2, "ch
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("views")
-    recording = write_hdf5(folder / "three.hdf5")
-    settings = Settings(val_fraction=0.3, cameras=("all",))
-    convert(arm(), recording, BlockTokenizer(), folder / "set", settings=settings)
-    return folder / "set"
+    return three_shards(tmp_path_factory.mktemp("views"), val_fraction=0.3)
 
 
 @pytest.fixture(scope="module")

@@ -303,9 +303,8 @@ def test_images_are_cropped_as_those_of_a_conversion(camera: dict[str, Any], cro
 
 
 def test_a_saved_dataset_names_the_cameras_that_the_model_shows(block_tokenizer, tmp_path) -> None:
-    arm, settings = three.arm(), Settings(val_fraction=0, cameras=("all",))
-    convert(arm, three.write_hdf5(tmp_path / "3.hdf5"), block_tokenizer, tmp_path / "set", settings=settings)
-    shards, stats = ShardSet(tmp_path / "set"), {"action": {"mean": [0.0, 0.0], "std": [1.0, 1.0]}}
+    shards = ShardSet(three.three_shards(tmp_path, val_fraction=0))
+    arm, stats = shards.embodiment, {"action": {"mean": [0.0, 0.0], "std": [1.0, 1.0]}}
 
     def saved(cameras: object) -> list[str]:
         robot = RecordedRobot(shards, lambda: block_tokenizer, stats, cameras)
