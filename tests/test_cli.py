@@ -1,7 +1,6 @@
 """The command line: exit codes, one-line errors, JSON, and that light verbs stay light."""
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from hma_data.errors import UsageError
 from hma_model.cli import main
 from tests.command import ROOT, fails, hma, hma_process
 from tests.conftest import ARM_YAML
+from tests.data.fresh import run_fresh
 
 
 def test_help_lists_the_verbs_and_every_verb_has_an_example() -> None:
@@ -58,9 +58,8 @@ for words in (
     assert main(words.split()), words
     assert "torch" not in sys.modules, words
 """
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert done.stderr.count("error: ") == len(done.stderr.splitlines()) == 15
+    said = run_fresh(code)
+    assert said.count("error: ") == len(said.splitlines()) == 15
 
 
 def test_light_verbs_import_nothing_heavy() -> None:
@@ -71,8 +70,7 @@ app(["registry", "list", "--json"], standalone_mode=False)
 heavy = {"torch", "cv2", "av", "h5py", "rosbags", "pyarrow", "matplotlib", "numpy"} & set(sys.modules)
 assert not heavy, heavy
 """
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    run_fresh(code)
 
 
 def test_tab_completes_verbs_robots_tokenizers_and_recipes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -187,8 +185,7 @@ def test_a_warning_is_one_line_without_its_place_in_the_code() -> None:
     code = (
         "import warnings; from hma_model.cli import main; main(['--version']); warnings.warn('two\\nlines')"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.stderr == "warning: two lines\n"
+    assert run_fresh(code) == "warning: two lines\n"
 
 
 def test_a_recording_is_named_first_or_by_source_but_once(toy_yaml: Path, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import sys
 import pytest
 
 from hma_data.cpu import bound_spinning
+from tests.data.fresh import run_fresh
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setscheduler"), reason="no schedulers to choose from")
@@ -23,8 +24,7 @@ def test_a_command_begun_under_real_time_priority_takes_the_ordinary_one() -> No
         "take_ordinary_priority()\n"
         "assert os.sched_getscheduler(0) == os.SCHED_OTHER\n"
     )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, done.stderr
+    run_fresh(script)
 
 
 @pytest.mark.parametrize(("name", "value"), [("OMP_WAIT_POLICY", "ACTIVE"), ("GOMP_SPINCOUNT", "7")])

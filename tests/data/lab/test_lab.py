@@ -253,14 +253,8 @@ def test_planner_predicts_what_the_physics_do(contact: int) -> None:
     assert np.linalg.norm(after - home, axis=1).mean() == pytest.approx(predicted, abs=2.0)
 
 
-def test_episodes_end_well_and_badly(fast: h5py.File, slow: list[Path]) -> None:
+def test_episodes_end_well_and_badly(fast: h5py.File) -> None:
     assert {bool(fast[f"data/{demo}"].attrs["success"]) for demo in fast["data"]} == {True, False}
-    outcomes = set()
-    for path in slow:
-        with path.open("rb") as file:
-            facts = {item.name: item.metadata for item in make_reader(file).iter_metadata()}["episode"]
-            outcomes.add(facts["success"])
-    assert outcomes == {"true", "false"}
 
 
 @pytest.mark.slow
@@ -327,13 +321,12 @@ def test_what_cannot_be_recorded_is_refused(tmp_path, robot, folder, episodes, f
 
 
 @pytest.mark.slow
-def test_the_bags_tell_success(tmp_path: Path) -> None:
-    folder = record("pusht_slow", tmp_path, 5, seed=0)
-    robot, source = find("pusht_slow"), open_source("rosbag")
-    told = [source.read(str(folder), name, robot).success for name in source.episode_ids(str(folder))]
+def test_bags_tell_how_their_episodes_end(slow: list[Path]) -> None:
+    folder, robot, source = str(slow[0].parent), find("pusht_slow"), open_source("rosbag")
+    told = [source.read(folder, name, robot).success for name in source.episode_ids(folder)]
     written = []
-    for path in sorted(folder.glob("*.mcap")):
+    for path in slow:
         with path.open("rb") as file:
             notes = {record.name: record.metadata for record in make_reader(file).iter_metadata()}
         written.append(notes["episode"]["success"] == "true")
-    assert told == written
+    assert told == written and set(told) == {True, False}
