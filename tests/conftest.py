@@ -44,13 +44,12 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     return bool(re.search(r"^pytestmark = .*mark\.slow", collection_path.read_text(), re.MULTILINE)) or None
 
 
-LEROBOT = ("test_to_lerobot.py", "test_lerobot_own.py")  # they import lerobot, which one worker does then
 LONG = ("test_notebooks.py", "test_tutorials.py")  # and mypy: no worker waits for them at the end
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put some tests first."""
-    items.sort(key=lambda item: item.path.name not in (*LEROBOT, *LONG) and "mypy" not in item.name)
+    items.sort(key=lambda item: item.path.name not in LONG and "mypy" not in item.name)
 
 
 @pytest.hookimpl(wrapper=True)

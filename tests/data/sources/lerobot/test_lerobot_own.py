@@ -22,6 +22,8 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import open_source
 from hma_data.storage.yaml_io import parse_yaml
 
+pytestmark = pytest.mark.slow  # of the import of lerobot, and of encoding AV1
+
 FPS, HEIGHT, WIDTH = 10, 64, 96
 LENGTHS = (12, 9, 15, 2, 11)
 TASKS = ("push the block", "größer als 3 → weiter")
@@ -107,14 +109,7 @@ def encoder(codec: str) -> dict[str, Any]:
     return {"rgb_encoder": RGBEncoderConfig(vcodec={"av1": "libsvtav1"}.get(codec, codec))}
 
 
-SLOW = pytest.mark.slow
-WAYS = [
-    "av1 many files",
-    *(pytest.param(way, marks=SLOW) for way in ("av1 one file", "h264 one file", "h264 many files")),
-]
-
-
-@pytest.fixture(scope="module", params=WAYS)
+@pytest.fixture(scope="module", params=["av1 many files", "av1 one file", "h264 one file", "h264 many files"])
 def written(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     codec, _, files = request.param.partition(" ")
     settle = many_files if files == "many files" else lambda writer: None
@@ -184,7 +179,6 @@ def test_success_and_a_text_column_are_the_episodes(written: Path) -> None:
     assert read[0].metadata["tasks"] == list(TASKS)
 
 
-@SLOW
 def test_depth_is_a_feature_but_no_camera(tmp_path: Path) -> None:
     depth = {"dtype": "video", "shape": (HEIGHT, WIDTH, 1), "names": SIDES, "info": {"is_depth_map": True}}
     still = depth | {"dtype": "image"}
@@ -209,7 +203,6 @@ def test_depth_is_a_feature_but_no_camera(tmp_path: Path) -> None:
             source.read(str(root), "episode_000000", arm(cameras=[{"name": "d", "key": key}], state=None))
 
 
-@SLOW
 def test_episodes_deleted_by_lerobot_leave_the_others_equal(tmp_path: Path) -> None:
     from lerobot.datasets.dataset_tools import delete_episodes
 
