@@ -85,7 +85,8 @@ def write_magvit2(path: Path, config: Magvit2Config = TINY_MAGVIT2, seed: int = 
 
 def altered(state: dict[str, Tensor], changes: dict[str, Tensor | None]) -> dict[str, Tensor]:
     """Return weights of which some are replaced, or left out where None."""
-    return {name: tensor for name, tensor in {**state, **changes}.items() if tensor is not None}
+    whole: dict[str, Tensor | None] = {**state, **changes}
+    return {name: tensor for name, tensor in whole.items() if tensor is not None}
 
 
 def tiny_halves(

@@ -145,7 +145,8 @@ def test_what_moves_weighs_more() -> None:
 def test_each_pass_makes_one_more_frame_of_the_past_that_of_a_rollout(changes: dict[str, Any]) -> None:
     model = unet(**{**changes, "frames": 6})
     batch, true = small_batch(model.config, ["arm"]), stored(model, 1, 6)
-    batch.tokens, batch.latents = (true, None) if model.config.kind == "discrete" else (None, true)
+    batch.tokens = true if model.config.kind == "discrete" else None
+    batch.latents = true if batch.tokens is None else None
     seen = forwarded(model, batch, 1.0, 3, torch.Generator().manual_seed(0)).context
     assert seen is not None
     first = int((seen != true).flatten(2).any(-1)[0].nonzero()[0])
