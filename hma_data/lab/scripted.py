@@ -108,6 +108,9 @@ def seen_state(robot: str, own: NDArray[np.int64], places: Floats) -> SeenState:
 class SeenPush:
     """The state of pusht_fast: the pusher follows its target with the lag of its spring."""
 
+    _agent: Floats
+    _tee: Floats
+
     def __init__(self, places: Floats) -> None:
         self.see(places)
 

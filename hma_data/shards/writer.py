@@ -62,13 +62,12 @@ class ShardWriter:
             columns: (T, …) values of the schema's columns; the two indexes are filled in, and so is a mask
                 that is missing or None, because all is known. What the schema lacks is left out.
         """
-        numbered = dict(columns)
+        numbered = {name: values for name, values in columns.items() if values is not None}
         length = len(numbered["timestamp"])
         numbered["episode_index"] = np.full(length, episode_index, np.int32)
         numbered["frame_index"] = np.arange(length, dtype=np.int32)
         for mask in ("action_known", "state_known"):
-            if numbered.get(mask) is None:
-                numbered[mask] = np.ones(length, np.bool_)
+            numbered.setdefault(mask, np.ones(length, np.bool_))
         arrays = [to_arrow(field, numbered[field.name]) for field in self._schema]
         table = pa.table(arrays, schema=self._schema)
         if self._pending and sum(map(len, self._pending)) + length > self._group:

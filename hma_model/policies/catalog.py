@@ -74,7 +74,7 @@ def identity(words: str) -> tuple[Any, ...]:
         options = {"horizon": 1} | given
     if kind == "plan" and rest:
         rest, given = split_options(kind, rest, planning.OPTIONS)
-        options = Planning.__init__.__kwdefaults__ | given
+        options = (Planning.__init__.__kwdefaults__ or {}) | given
     if kind in ("hma", "lerobot") and rest and Path(rest).exists():
         rest = str(Path(rest).resolve())
     return (kind, rest, *sorted(options.items())) if rest else (kind,)
