@@ -199,12 +199,12 @@ def test_a_full_disk_is_one_error_and_what_was_made_is_kept(
 ) -> None:
     add, calls = shard_work.ShardWriter.add, 0
 
-    def full(self, episode):
+    def full(self, episode, columns):
         nonlocal calls
         calls += 1
         if calls == 9:
             raise OSError(28, "No space left on device")
-        add(self, episode)
+        add(self, episode, columns)
 
     monkeypatch.setattr(shard_work.ShardWriter, "add", full)
     with pytest.raises(OutputError, match=r"No space left on device .* free space"):

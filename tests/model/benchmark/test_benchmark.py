@@ -263,7 +263,7 @@ def test_finished_results_of_a_killed_job_still_record_meters_and_remove_its_par
     found = json.loads((tmp_path / "out" / RESULTS).read_text())
     (robot, one), *_ = found["measures"].items()
     assert all("missing" in other["calibration"] for other in found["measures"].values())
-    one["calibration"], recorded = {"meter": {"limit": 2.0}}, list[Any]()
+    one["calibration"]["meter"], recorded = {"limit": 2.0}, list[Any]()
     del found["sha256"]
     (tmp_path / "out" / RESULTS).write_text(json.dumps(found))
     monkeypatch.setattr(running, "record_locally", lambda *given: recorded.append(given[2:]))

@@ -60,7 +60,7 @@ def test_a_robot_of_two_checkpoints_holds_as_long_as_in_the_one_that_drives_it(m
     monkeypatch.setattr(server, "run", run)
     (robot,) = lab_robots("mover_04").values()
     parts = [
-        server.Part(SimpleNamespace(name=name, config=SimpleNamespace(kind="discrete")), None, {key: robot})  # type: ignore
+        server.Part(SimpleNamespace(name=name, config=SimpleNamespace(discrete=True)), None, {key: robot})  # type: ignore
         for name, key in (("one", "mover_04"), ("two", "mover_04:recordings"))
     ]
     asyncio.run(server.serve(parts, "models", None, "", None, lambda: None))  # type: ignore[arg-type]

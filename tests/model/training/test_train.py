@@ -209,7 +209,7 @@ def test_too_little_memory_is_said_with_what_lowers_it(recipe, tmp_path, fault):
     def fail(facts):
         raise fault
 
-    with pytest.raises(TrainingError, match="memory: too little .* — set batch_size=2 accumulate=2,"):
+    with pytest.raises(TrainingError, match="memory: too little .* — set batch_size=2 accumulate=2$"):
         train(recipe(), out=tmp_path / "run", show=False, on_progress=fail)
 
 
