@@ -254,7 +254,7 @@ TOKENIZERS = {
     "unet_tiny": "raw-128",
     "finetune_colors": "palette-64",
     "unet_colors": "palette-64",
-    "world_fetch": "palette-64",
+    "world_arm": "palette-64",
     "world_pusht": "palette-64",
     "world_unet": "palette-64",
 }
