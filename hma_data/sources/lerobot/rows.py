@@ -170,7 +170,7 @@ def _read(path: Path, state: State, group: int, key: str) -> pa.Array:
     with pq.ParquetFile(path, metadata=_footer(path, state).metadata) as file:
         held = file.metadata.row_group(group)
         columns = [held.column(i) for i in range(held.num_columns)]
-        parts = [item for item in columns if item.path_in_schema.startswith(key)]
+        parts = [item for item in columns if f"{item.path_in_schema}.".startswith(f"{key}.")]
         size = max((item.total_uncompressed_size for item in parts), default=0)
         values = max((item.num_values for item in parts), default=0)
         if size > MAX_BYTES or max(values, held.num_rows) > MAX_VALUES:

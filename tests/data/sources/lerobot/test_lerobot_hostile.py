@@ -8,6 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from hma_data.sources.lerobot import rows
 from tests.data.sources.lerobot.test_lerobot import embodiment
 from tests.data.videos import CAMERA, STILL, encode, make_v2, make_v3
 from tests.hostile import Edit, Row, check_refused, cut, of, swap, untouched, values, whole
@@ -122,3 +123,11 @@ def test_a_hostile_dataset_is_one_line(case: str, made: dict[str, Path], tmp_pat
     row = (ONE | ALL)[case]
     robot = embodiment(**dict(*row[2:]))
     check_refused(row, folder, robot, tmp_path / "out", one=case in ONE, inspected=INSPECTED.get(case, ""))
+
+
+def test_a_large_column_does_not_refuse_one_whose_name_begins_its_own(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(rows, "MAX_BYTES", 10_000)
+    whole = pa.table({"action": pa.array([[0.5]] * 9), "action_images": [bytes(2000)] * 9})
+    pq.write_table(whole, tmp_path / "rows.parquet", use_dictionary=False)
+    read = rows._read(tmp_path / "rows.parquet", rows._state(tmp_path / "rows.parquet"), 0, "action")
+    assert read.to_pylist() == [[0.5]] * 9
