@@ -23,7 +23,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/loading": (1_282, 10_903, 6),
     "hma_data/registry": (1_273, 8_228, 6),
     "hma_data/shards": (2_501, 19_287, 11),
-    "hma_data/sources": (12_610, 104_932, 50),
+    "hma_data/sources": (12_610, 104_938, 50),
     "hma_data/storage": (1_690, 11_090, 11),
     "hma_data/tokenizers": (3_471, 25_528, 18),
     "hma_model": (569, 3_464, 4),
@@ -41,11 +41,11 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/policies": (2_817, 20_083, 14),
     "hma_model/released": (809, 6_821, 4),
     "hma_model/synthetic": (1_190, 9_012, 5),
-    "hma_model/training": (3_694, 30_235, 20),
+    "hma_model/training": (3_697, 30_245, 20),
     "hma_model/worlds": (1_543, 11_865, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_557, 518_936
-TEST_LINES = 48_644
+PRODUCT_LINES, PRODUCT_NODES = 65_560, 518_952
+TEST_LINES = 48_653
 DOC_WORDS = 41_700
 
 

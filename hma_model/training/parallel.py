@@ -16,6 +16,7 @@ import os
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
@@ -248,6 +249,8 @@ class ParallelModel:
         if len(apart) == len(trained):
             return
         _DDP._set_params_and_buffers_to_ignore_for_model(model, apart)
+        # A gradient of a 1×1 convolution may have other strides than its weights; DDP copies it, and warns.
+        warnings.filterwarnings("ignore", "Grad strides do not match bucket view strides")
         device = [model.device] if model.device.type == "cuda" else None
         self._call = _DDP(model, device_ids=device, find_unused_parameters=not whole, broadcast_buffers=False)
 
