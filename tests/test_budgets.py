@@ -31,7 +31,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/checkpoint": (945, 7_273, 5),
     "hma_model/cli": (1_754, 11_305, 12),
     "hma_model/demo": (476, 4_001, 4),
-    "hma_model/evaluation": (4_470, 35_550, 24),
+    "hma_model/evaluation": (4_473, 35_601, 24),
     "hma_model/export": (1_169, 9_247, 9),
     "hma_model/generation": (1_632, 13_093, 9),
     "hma_model/hub": (1_071, 8_179, 6),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_697, 30_245, 20),
     "hma_model/worlds": (1_543, 11_865, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_560, 518_952
-TEST_LINES = 48_653
+PRODUCT_LINES, PRODUCT_NODES = 65_563, 519_003
+TEST_LINES = 48_662
 DOC_WORDS = 41_700
 
 

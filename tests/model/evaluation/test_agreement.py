@@ -189,7 +189,16 @@ def test_an_interval_of_several_policies_holds_the_true_accuracy_as_often_as_it_
 def test_only_episodes_with_different_outcomes_tell_policies_apart() -> None:
     success = np.zeros((3, 24), bool)
     success[1, :5] = success[2, :6] = True
-    assert alike_pairs(success) == [(0, 1), (1, 2)]  # five of five is a surprise of 1 in 16, six of 1 in 32
+    assert alike_pairs(success[:2]) == [(0, 1)]  # five of five is a surprise of 1 in 16
+    assert alike_pairs(success[[0, 2]]) == []  # six of six of 1 in 32
+    assert alike_pairs(success) == [(0, 1), (0, 2), (1, 2)]  # which is none among three pairs
+    assert alike_pairs(success[:1]) == []
+
+
+def test_equal_policies_are_seldom_told_apart_among_many_pairs() -> None:
+    rng = np.random.default_rng(4)
+    told = [len(alike_pairs(rng.random((7, 100)) < 0.5)) < 21 for _ in range(200)]
+    assert np.mean(told) < 0.1  # 0.4 without the correction
 
 
 def correlation_by_hand(one: list[float], other: list[float]) -> float:
