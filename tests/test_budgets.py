@@ -46,7 +46,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
 }
 PRODUCT_LINES, PRODUCT_NODES = 65_563, 519_003
 TEST_LINES = 48_662
-DOC_WORDS = 41_700
+DOC_WORDS = 41_770
 
 
 @cache

@@ -25,7 +25,7 @@ part() { # name, seconds at most, command …
 echo "$gpu" | tee "$out/gpu.txt"
 export WORKERS=${WORKERS:-$(nproc)} PROCESSES=1
 push=${WORLD:-/tmp/world}/push lab=${WORLD:-/tmp/world}/lab
-part push 600 recipes/world/pusht.sh "$push" cpu_seconds=240 batch_size=256 lr=3e-3 compile=true ${START:+start=$START}
+part push 600 recipes/world/pusht.sh "$push" cpu_seconds=150 batch_size=256 lr=3e-3 compile=true ${START:+start=$START}
 part lab 420 recipes/world/make.sh "$lab" cpu_seconds=240 batch_size=256 lr=3e-3 compile=true
 for name in push lab; do
     mkdir -p "$out/$name"
