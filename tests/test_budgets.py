@@ -38,13 +38,13 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/lerobot_env": (631, 4_785, 3),
     "hma_model/network": (3_486, 30_231, 18),
     "hma_model/play": (1_610, 11_859, 8),
-    "hma_model/policies": (2_817, 20_083, 14),
+    "hma_model/policies": (2_818, 20_092, 14),
     "hma_model/released": (809, 6_821, 4),
     "hma_model/synthetic": (1_190, 9_012, 5),
     "hma_model/training": (3_697, 30_245, 20),
     "hma_model/worlds": (1_543, 11_865, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_563, 519_003
+PRODUCT_LINES, PRODUCT_NODES = 65_564, 519_012
 TEST_LINES = 48_662
 DOC_WORDS = 41_770
 

@@ -22,6 +22,7 @@ from hma_model.policies.base import split_options
 from hma_model.worlds.images import Prompt
 from hma_model.worlds.world import World, load_world
 
+HORIZON = 1  # chunks between two looks, by default
 OPTIONS: dict[str, type] = {"horizon": int, "memory": int, "temperature": float, "unmask_steps": int}
 
 
@@ -117,7 +118,7 @@ class Acting:
         self,
         world: World,
         scenes: Scenes,
-        horizon: int = 1,
+        horizon: int = HORIZON,
         where: str = "the model",
         memory: int | None = None,
     ) -> None:
@@ -160,7 +161,7 @@ class Acting:
 def read_acting(words: str, scenes: Scenes, device: str = "cpu") -> Acting:
     """Return the policy of `CHECKPOINT` or `CHECKPOINT,memory=1,horizon=2,temperature=0.5,unmask_steps=2`."""
     checkpoint, options = split_options("hma", words, OPTIONS)
-    horizon = options.pop("horizon", 1)
+    horizon = options.pop("horizon", HORIZON)
     memory = options.pop("memory", None)
     world = load_world(checkpoint, [scenes.name], device=device, **options)
     return Acting(world, scenes, horizon, f"policy hma:{checkpoint}", memory)

@@ -71,7 +71,7 @@ def identity(words: str) -> tuple[Any, ...]:
         return ("random",) if share == 1 else (kind, share)
     if kind == "hma" and rest:
         rest, given = split_options(kind, rest, acting.OPTIONS)
-        options = {"horizon": 1} | given
+        options = {"horizon": acting.HORIZON} | given
     if kind == "plan" and rest:
         rest, given = split_options(kind, rest, planning.OPTIONS)
         options = (Planning.__init__.__kwdefaults__ or {}) | given

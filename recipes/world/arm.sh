@@ -7,10 +7,14 @@
 # Training takes 70 CPU minutes on each of two processes. Everything continues where it was. EPISODES (800) are
 # recorded in four parts; `uv` installs the simulator. SCENES are the held-out recordings of the film.
 set -euo pipefail
+here=$(cd "$(dirname "$0")/../.." && pwd)
+if [ ! -e "$here/recipes/lab/${1-}.py" ] || [ -z "${2-}" ]; then
+    echo "error: arm.sh ${1-}: wants a recorder of recipes/lab and a folder — aloha_sim, fetch, panda or sawyer, then OUT" >&2
+    exit 2
+fi
 robot=$1
 out=$2
 shift 2
-here=$(cd "$(dirname "$0")/../.." && pwd)
 mkdir -p "$out/recordings" "$out/parts"
 for part in 7 8 9 10; do # robosuite keeps the memory of every episode, so each part has a process of its own
     if [ ! -e "$out/recordings/$part" ]; then
