@@ -35,7 +35,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/export": (1_169, 9_247, 9),
     "hma_model/generation": (1_632, 13_093, 9),
     "hma_model/hub": (1_071, 8_179, 6),
-    "hma_model/lerobot_env": (631, 4_785, 3),
+    "hma_model/lerobot_env": (634, 4_814, 3),
     "hma_model/network": (3_486, 30_231, 18),
     "hma_model/play": (1_610, 11_859, 8),
     "hma_model/policies": (2_818, 20_092, 14),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_697, 30_245, 20),
     "hma_model/worlds": (1_543, 11_865, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_564, 519_012
-TEST_LINES = 48_662
+PRODUCT_LINES, PRODUCT_NODES = 65_567, 519_041
+TEST_LINES = 48_675
 DOC_WORDS = 41_770
 
 

@@ -109,8 +109,11 @@ class WorldModelPolicy(PreTrainedPolicy):
         return torch.from_numpy(action)
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **unused: Any) -> Tensor:
-        """Return the actions (N, stride, A) from the newest images on."""
-        return torch.from_numpy(np.stack(self._chunk(batch), axis=1))
+        """Return the actions (N, stride, A) from the newest images on; the next call counts them as taken."""
+        self._taken.extend(self._ahead)
+        self._ahead.clear()
+        self._taken = self._chunk(batch)
+        return torch.from_numpy(np.stack(self._taken, axis=1))
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Any] | None]:
         """Refuse to train."""

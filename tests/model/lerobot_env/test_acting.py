@@ -62,6 +62,19 @@ def test_it_gives_the_actions_of_the_same_model_in_policy_eval(run: Path) -> Non
     assert not policy._sessions and not policy._taken
 
 
+def test_chunks_asked_for_at_once_are_the_actions_given_one_by_one(run: Path) -> None:
+    one, whole = (WorldModelPolicy(WorldModelConfig(checkpoint=str(run), device="cpu")) for _ in range(2))
+    rng = np.random.default_rng(0)
+    for seen in rng.integers(0, 256, (3, 2, 128, 128, 3), np.uint8):
+        given = whole.predict_action_chunk(batch(seen))
+        wanted = [one.select_action(batch(seen)) for _ in range(given.shape[1])]
+        assert torch.equal(given, torch.stack(wanted, dim=1))
+    one.select_action(batch(seen))
+    whole.predict_action_chunk(batch(seen))
+    last = [policy.predict_action_chunk(batch(seen)) for policy in (one, whole)]
+    assert torch.equal(*last)  # what was left of a chunk counts as carried out
+
+
 def test_lerobot_finds_it_and_its_processors_by_its_name(run: Path) -> None:
     assert get_policy_class("hma") is WorldModelPolicy
     config = PreTrainedConfig.get_choice_class("hma")(checkpoint=str(run), device="cpu")
