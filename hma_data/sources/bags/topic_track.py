@@ -146,8 +146,9 @@ class Column:
     """The values of one component, gathered message by message.
 
     Where a message names its values (see `value_names`), the component's `names` select and order them,
-    unless the key or the YAML slices. Messages of another publisher, with none of those names, are left out;
-    so are those of another type without the field, where a topic has several types.
+    unless the key or the YAML slices. Otherwise all messages must name the same. Messages of another
+    publisher, with none of the component's names, are left out; so are those of another type without the
+    field, where a topic has several types.
     """
 
     def __init__(self, component: Component, field: Field, where: str, several_types: bool = False) -> None:
@@ -157,6 +158,9 @@ class Column:
         self._where = where
         self._values, self._rows = array("d"), array("q")
         self._width: int | None = None
+        self._names: tuple[str, ...] = ()  # of the values, where they are not selected by names
+        # The place in a path of the values that the last field has, before an index or a slice of them.
+        self._whole = max((i for i, step in enumerate(field.steps, 1) if isinstance(step, str)), default=0)
         self._picks: dict[tuple[str, ...], list[int] | None] = {}
         whole = not component.slice and field.steps and isinstance(field.steps[-1], str)
         self._selects = bool(component.names and whole)
@@ -187,6 +191,8 @@ class Column:
             if picks is None:
                 return
             values = [values[i] for i in picks]
+        elif is_list(path[self._whole]):
+            self._require_names(value_names(path[self._whole - 1 :: -1], len(path[self._whole])), row)
         if not values:
             raise EpisodeError(self._where, f"{self.field.key} is empty in message {row}")
         self._width = self._width or len(values)
@@ -195,6 +201,14 @@ class Column:
             raise EpisodeError(self._where, said)
         self._values.extend(values)
         self._rows.append(row)
+
+    def _require_names(self, names: tuple[str, ...], row: int) -> None:
+        """Raise EpisodeError if a message, maybe of another publisher, has other joints or another order."""
+        if self._names and names and names != self._names:
+            before, now = ", ".join(self._names), ", ".join(names)
+            fault = f"{self.field.key} is of {before}, then of {now} in message {row}"
+            raise EpisodeError(self._where, fault, "give the component names in the YAML, without a slice")
+        self._names = self._names or names
 
     def rows(self) -> NDArray[np.int64]:
         """Return the indices of the messages that gave values.

@@ -77,6 +77,14 @@ def test_names_pick_the_values_wherever_a_message_has_them(key: str, tmp_path: P
         np.testing.assert_array_equal(episode.actions[0].values, expected)
 
 
+@pytest.mark.parametrize("key", [*MESSAGES, "/cmd.position[0:3]"])
+def test_joints_that_change_places_are_refused_without_names(key: str, tmp_path: Path) -> None:
+    path = shuffled_bag(tmp_path / "run", key.removesuffix("[0:3]"))
+    values = robot().to_dict() | {"action": {"space": "mixed", "components": [{"key": key, "dims": 3}]}}
+    with pytest.raises(EpisodeError, match=r"is of \w+, \w+, \w+, then of .* — give the component names"):
+        SOURCE.read(str(path), "run", Embodiment.from_values(values, ""))
+
+
 @pytest.mark.parametrize("key", MESSAGES)
 def test_infer_names_them(key: str, tmp_path: Path) -> None:
     path = shuffled_bag(tmp_path / "run", key)

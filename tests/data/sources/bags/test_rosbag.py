@@ -210,7 +210,7 @@ def test_a_second_publisher_of_joints_keeps_its_own_times(numbers_bag: Path) -> 
         ("/cmd.angular[0]", 1, "", "not a list"),
         ("/joints.position[5]", 1, "", "list has 2 values"),
         ("/joints.position[0:2]", 2, "", "list has 1 values"),
-        ("/joints.position", 2, "", "has 2 values, then 1"),
+        ("/joints.position", 2, "", "is of a, b, then of gripper in message 1 — give the component names"),
         ("/joints.position", 2, ", names: [a, z]", "lacks z.*names a, b"),
         ("/joints.position", 1, ", names: [z]", "no message names z.*a, b, gripper"),
         ("/joints.velocity", 1, "", "is empty in message 0"),
