@@ -18,12 +18,14 @@ from hma_data.registry.components import Camera, Quality
 Images = NDArray[np.uint8]
 Filter = Literal["area", "linear", "antialias"]
 _REDUCED = ((8, 64), (4, 32), (2, 16))  # share of a JPEG's sides, and the flag of cv2.IMREAD_REDUCED_*
+TIFF = (b"II*\0", b"MM\0*")
 BATCH = 16  # pictures that `antialias` resizes in one call
 MAX_PIXELS = 64_000_000  # a picture that claims more is a decompression bomb or an error
 FINE_BLOCKS, COARSE_BLOCKS = (16, 16), (8, 8)  # blocks
 BLANK_LEVELS = 8  # levels from the darkest to the brightest coarse block: 3 % of full scale
 STILL_LEVELS = 4  # levels by which a fine block changes
 BT601, OTHER_MATRICES = 5, (1, 7, 9)  # FFmpeg's AVCOL_SPC: BT.709, SMPTE 240M and BT.2020 differ from BT.601
+DEPTH_BITS = 12  # of one channel, at least; cameras of grey have 8 or 10
 LIMITED, FULL = 1, 2  # FFmpeg's AVCOL_RANGE: luma of 16 to 235, or of 0 to 255
 
 
@@ -52,8 +54,7 @@ def decode_image(data: bytes | NDArray[np.uint8], where: str, least: int = 0) ->
     cv2 = opencv()
     buffer = np.frombuffer(data, np.uint8) if isinstance(data, bytes | bytearray | memoryview) else data
     head = buffer[:26].tobytes()
-    if head[:8] == b"\x89PNG\r\n\x1a\n" and head[24:] in (b"\x10\0", b"\x10\4"):
-        raise EpisodeError(where, "an image has 16 bits of grey: depth, not colour", "name another camera")
+    bits = 16 if head[:8] == b"\x89PNG\r\n\x1a\n" and head[24:] in (b"\x10\0", b"\x10\4") else 8
     flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
     if least and head[:2] == b"\xff\xd8":
         side = _short_side(memoryview(buffer))
@@ -61,8 +62,15 @@ def decode_image(data: bytes | NDArray[np.uint8], where: str, least: int = 0) ->
     fault = ""
     try:
         picture = cv2.imdecode(buffer, flags) if len(buffer) else None
+        whole = cv2.imdecode(buffer, cv2.IMREAD_UNCHANGED) if head[:4] in TIFF else None
+        if whole is not None and whole.ndim == 2:
+            bits = 8 * whole.itemsize
     except cv2.error as error:  # OpenCV checks the claimed size before it decodes
         picture, fault = None, f": {error.err}"
+    if bits > 8:
+        raise EpisodeError(
+            where, f"an image has {bits} bits of grey: depth, not colour", "name another camera"
+        )
     if picture is None:
         raise EpisodeError(where, f"an image of {len(buffer)} bytes cannot be decoded{fault}")
     return picture
@@ -83,16 +91,24 @@ class FrameToRGB:
     """A converter of PyAV's video frames to RGB, by the matrix and range that they state; one serves many.
 
     A frame that states none is BT.601 in the range of its pixel format, as FFmpeg has it.
+
+    Args:
+        where: the video, for the error.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, where: str) -> None:
         from av.video.reformatter import VideoReformatter
 
+        self._where = where
         # Two, because FFmpeg keeps the matrix of the frame before, and a video may change what it states.
         self._usual, self._stated = VideoReformatter(), VideoReformatter()
 
     def __call__(self, frame: Any) -> Images:
-        """Return the frame's image (H, W, 3), a view of FFmpeg's memory."""
+        """Return the frame's image (H, W, 3), a view of FFmpeg's memory.
+
+        Raises:
+            EpisodeError: it is depth: one channel of 12 bits (lerobot's) or more.
+        """
         rgb = self._converted(frame)
         plane = rgb.planes[0]
         lines = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: rgb.height, : rgb.width * 3]
@@ -101,6 +117,9 @@ class FrameToRGB:
     def _converted(self, frame: Any) -> Any:
         """Return the frame as one of PyAV in rgb24."""
         full, kind = frame.color_range == FULL, frame.format
+        if len(kind.components) == 1 and (bits := kind.components[0].bits) >= DEPTH_BITS:
+            fault = f"the video has {bits} bits of grey: depth, not colour"
+            raise EpisodeError(self._where, fault, "name another camera")
         other = frame.colorspace in OTHER_MATRICES
         # FFmpeg converts RGB, grey and "yuvj" the same with and without what they state.
         colourless = kind.is_rgb or len(kind.components) < 3

@@ -229,8 +229,10 @@ def _pixels(message: Any, where: str, pixel: int) -> Images:
     step = step or row
     data = child(message, "data")
     flat = data if isinstance(data, np.ndarray) else np.frombuffer(payload(message), np.uint8)
-    odd = planar and (height % 2 or width % 2)
-    if odd or step < row or len(flat) < step * (rows - 1) + row:
+    shared = planar or (pixel == 2 and stated.lower() != MONO16)  # two pixels of YUV share their colour
+    if (shared and width % 2) or (planar and height % 2):
+        raise EpisodeError(where, f"an image of {width}×{height} in {stated} does not have even sides")
+    if step < row or len(flat) < step * (rows - 1) + row:
         raise EpisodeError(
             where, f"an image of {width}×{height} in {stated} has {len(flat):,} bytes, rows of {step}"
         )
@@ -343,7 +345,7 @@ class VideoDecoder:
         self._reorders = reorders
         self._group, self._shown = 0, 0  # the key frame of the frames last shown; how many were shown since
         self._context: Any = None
-        self._to_rgb = FrameToRGB()
+        self._to_rgb = FrameToRGB(where)
         self._next = 0  # the message that the decoder takes next
         self._taken = -1  # the last image returned
         self._ready: dict[int, Any] = {}  # images decoded but not returned yet; None for a damaged one

@@ -262,7 +262,7 @@ class VideoFile:
         stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
         self._decoder, self._next, self._entry = self._container.decode(stream), 0, -1
         self._spoilt = False
-        self._converter = FrameToRGB()  # one for all frames: making one costs a third of the time
+        self._converter = FrameToRGB(str(self.path))  # one for all frames: making one takes long
 
     def _index_of(self, frame: Any) -> int:
         """Return the frame's index; -1 for a frame that comes before the first shown."""

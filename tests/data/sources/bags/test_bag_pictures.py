@@ -111,6 +111,7 @@ def test_mono16_that_its_driver_compressed_to_8_bits_needs_no_levels() -> None:
         {"height": 0},
         {"width": -4},
         {"width": None},
+        {"encoding": "yuv422", "width": 3},
     ],
 )
 def test_a_raw_picture_that_does_not_fit_is_refused(broken: dict[str, Any]) -> None:

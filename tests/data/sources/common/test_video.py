@@ -295,7 +295,10 @@ def test_a_damaged_picture_is_a_picture_or_our_error(data: st.DataObject) -> Non
         assert str(fault)
 
 
-def test_depth_is_no_picture() -> None:
-    depth = cv2.imencode(".png", np.full((8, 8), 3000, np.uint16))[1].tobytes()
-    with pytest.raises(EpisodeError, match="16 bits of grey: depth, not colour"):
+@pytest.mark.parametrize(
+    ("suffix", "dtype", "bits"), [(".png", "u2", 16), (".tiff", "u2", 16), (".tiff", "f4", 32)]
+)
+def test_depth_is_no_picture(suffix: str, dtype: str, bits: int) -> None:
+    depth = cv2.imencode(suffix, np.full((8, 8), 3000, dtype))[1].tobytes()
+    with pytest.raises(EpisodeError, match=f"{bits} bits of grey: depth, not colour"):
         decode_image(depth, "camera 0")

@@ -295,6 +295,12 @@ def test_grey_has_no_matrix(tmp_path: Path, kind: str, matrix: int, full: bool) 
     assert np.array_equal(VideoFile(path).frames([0])[0], by_ffmpeg(path))
 
 
+@pytest.mark.parametrize("kind", ["gray12le", "gray16le"])
+def test_depth_is_no_video(tmp_path: Path, kind: str) -> None:
+    with pytest.raises(EpisodeError, match=rf"v\.mkv: the video has {kind[4:6]} bits of grey: depth"):
+        VideoFile(film(tmp_path / "v.mkv", UNSTATED, False, "ffv1", kind)).frames([0])
+
+
 @pytest.mark.parametrize("matrix", [UNSTATED, BT709])
 @pytest.mark.parametrize("kind", ["bgr0", "gbrp10le"])
 def test_rgb_has_no_matrix(tmp_path: Path, kind: str, matrix: int) -> None:
