@@ -16,14 +16,14 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data": (721, 4_168, 7),
     "hma_data/cli": (1_543, 11_005, 8),
     "hma_data/conversion": (4_141, 30_714, 15),
-    "hma_data/episodes": (1_694, 14_870, 9),
+    "hma_data/episodes": (1_713, 15_007, 9),
     "hma_data/hub": (517, 3_857, 3),
     "hma_data/inspection": (2_123, 19_988, 8),
     "hma_data/lab": (3_304, 30_340, 16),
     "hma_data/loading": (1_282, 10_903, 6),
     "hma_data/registry": (1_273, 8_228, 6),
     "hma_data/shards": (2_501, 19_287, 11),
-    "hma_data/sources": (12_610, 104_938, 50),
+    "hma_data/sources": (12_639, 105_384, 50),
     "hma_data/storage": (1_690, 11_090, 11),
     "hma_data/tokenizers": (3_471, 25_528, 18),
     "hma_model": (569, 3_464, 4),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_697, 30_245, 20),
     "hma_model/worlds": (1_543, 11_865, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_567, 519_041
-TEST_LINES = 48_675
+PRODUCT_LINES, PRODUCT_NODES = 65_615, 519_624
+TEST_LINES = 48_734
 DOC_WORDS = 41_770
 
 

@@ -28,6 +28,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.episodes.align import is_off_rate, measured_hz
 from hma_data.episodes.episode import Episode, Floats, Signal, Stream, rate_times
 from hma_data.errors import EpisodeError, HMAError, SourceError
 from hma_data.registry.components import Hdf5Layout
@@ -240,6 +241,10 @@ def _times(
         raise EpisodeError(where, f"{key!r} holds {values.shape} {values.dtype}, not a time a frame")
     times = values.reshape(-1)
     unit = seconds_a_unit(np.unique(times), key)
+    found = measured_hz(np.diff(times)) if len(times) > 2 else None
+    if unit is None and found and (not isinstance(hz, float) or is_off_rate(found, embodiment)):
+        fault = f"{key!r} steps by {1 / found:g}, which is not known to be s, ms, µs or ns"
+        raise EpisodeError(where, fault, "state frequency_hz and leave out source.layout.timestamps")
     seconds = seconds_of(times, key) if unit not in (None, 1.0) else None
     return times.astype(np.float64) if seconds is None else seconds
 

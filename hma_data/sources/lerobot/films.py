@@ -121,8 +121,10 @@ class _Parts:
         they slipped in anywhere, and moved all that follows.
         """
         tail = self._after[-1]
+        # An episode without rows would explain any number of frames.
+        shortest = self._rows.min(where=self._rows > 0, initial=len(self._clock) + 1)
         is_usual = len(self._after) > 1 and bool((self._after == tail).all())
-        return bool(tail <= 0 or tail >= self._rows.min() or is_usual)
+        return bool(tail <= 0 or tail >= shortest or is_usual)
 
     def unused(self) -> dict[int, int]:
         """Return episode index -> frames between its last row and the next episode, where there are any."""

@@ -236,7 +236,7 @@ class Metadata:
         if not self._is_v3:
             return Span(index, path, row["length"])
         start, stop = row.get(f"videos/{key}/from_timestamp"), row.get(f"videos/{key}/to_timestamp")
-        if not (isinstance(start, float) and isinstance(stop, float) and 0 <= start < math.inf):
+        if not (isinstance(start, float | int) and isinstance(stop, float | int) and 0 <= start < math.inf):
             raise EpisodeError(episode_name(index), f"meta/episodes does not say where {key} begins and ends")
         return Span(index, path, row["length"], start, stop)
 

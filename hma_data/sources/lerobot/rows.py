@@ -102,6 +102,7 @@ def rows_of(meta: Metadata, index: int) -> Rows:
         state = _state(path)
         footer = _footer(path, state)
         places = [np.zeros((0, 2), np.int64)]
+        Rows(path, footer.columns, places[0]).check("episode_index")
         for group in np.flatnonzero((footer.lows <= index) & (index <= footer.highs)).tolist():
             stored = _column_of_group(path, state, group, "episode_index")
             within = np.flatnonzero(stored.to_numpy(zero_copy_only=False) == index)

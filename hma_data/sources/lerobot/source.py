@@ -132,7 +132,7 @@ class LeRobotSource:
             streams=streams,
             actions=(Signal(times, read(embodiment.action)),),
             states=(Signal(times, read(embodiment.state)),) if embodiment.state else (),
-            instruction=_instruction(rows, embodiment.source.instruction, tasks),
+            instruction=_instruction(meta, rows, embodiment.source.instruction, tasks),
             success=_success(rows),
             source=str(rows.path),
             metadata=metadata,
@@ -198,10 +198,15 @@ def _video_sample(path: Path) -> str:
         return hashlib.sha256(b"%d" % size + head + file.read(_SAMPLE)).hexdigest()
 
 
-def _instruction(rows: Rows, key: str | None, tasks: list[str]) -> str:
-    if key and key != "task":
-        return str(rows.column(key)[0].as_py() or "")
-    return tasks[0] if tasks else ""
+def _instruction(meta: Metadata, rows: Rows, key: str | None, tasks: list[str]) -> str:
+    if not key or key == "task":
+        return tasks[0] if tasks else ""
+    said = rows.column(key)[0].as_py()
+    if isinstance(said, int):  # GR00T: the annotations are numbers of tasks
+        if said not in meta.tasks:
+            raise EpisodeError(rows.path, f"{key!r} is {said}, the number of no task")
+        said = meta.tasks[said]
+    return str(said or "")
 
 
 def _success(rows: Rows) -> bool | None:

@@ -111,6 +111,7 @@ def laid_out(**layout: str) -> dict[str, Any]:
     return {"source": {"format": "hdf5", "layout": layout}}
 
 
+TIMED = laid_out(timestamps="t")
 REF, OBJECT, LONG = h5py.ref_dtype, h5py.regionref_dtype, h5py.vlen_dtype(np.float64)
 FAR, SMALL = "keeps its values in other files", np.zeros((T - 1, 2))
 IN, NOWHERE, AWAY = h5py.ExternalLink("secret.bin", "/in"), h5py.SoftLink("/nowhere"), h5py.SoftLink("/away")
@@ -161,6 +162,7 @@ ALL: dict[str, Row] = {  # no demo can be used
     "few states": (put("short", data=SMALL), "differ in length", {"state": {"components": [SHORT]}}),
     "depth": (put("d", data=np.zeros((T, H, W, 1), "f4")), "float32, not colour images", sees("d")),
     "other axes": (untouched, r"images \(12, 16, 3\), source\.layout\.axes says TCHW", laid_out(axes="TCHW")),
+    "times of no unit": (put("t", data=np.arange(T) * 50), "'t' steps by 50, .* not known", TIMED),
     "a bomb of a chunk": (put("bomb", **WIDE), "too large to read", acts(BOMB)),
     "a file cut short": (of(FILE, cut(5000)), r"demos\.hdf5: cannot be read as HDF5"),
     "an empty file": (of(FILE, cut(0)), r"demos\.hdf5: is empty"),

@@ -125,6 +125,15 @@ def test_how_a_film_fits_is_known_without_keeping_the_times_of_its_frames(tmp_pa
         source.read(str(folder), EPISODES[0], robot())
 
 
+def of_no_rows(folder: Path) -> Path:
+    """List an episode without rows at the end of the video."""
+    path = folder / "meta/episodes/chunk-000/file-000.parquet"
+    listed = pq.read_table(path).to_pylist()
+    empty = listed[-1] | {"episode_index": 3, "length": 0, f"videos/{CAMERA}/from_timestamp": 3.6}
+    pq.write_table(pa.Table.from_pylist([*listed, empty]), path)
+    return folder
+
+
 def shows(shown: Sequence[int], stamps: Sequence[float] | None = None) -> Edit:
     return lambda folder: film(folder, shown, stamps)
 
@@ -147,6 +156,7 @@ HOSTILE: dict[str, Row] = {  # every episode of the video is refused
     "a frame four times": (shows([*SHOWN[:9], 8, 8, 8, *SHOWN[9:]]), "has 39 frames for 36 rows"),
     "the first twice": (shows([0, *SHOWN]), MORE),
     "the last twice": (shows([*SHOWN, 34]), MORE),
+    "the last twice, and no rows": (lambda folder: film(of_no_rows(folder), [*SHOWN, 34]), f"{MORE[:-10]}4"),
     "a frame missing": (shows([*SHOWN[:4], *SHOWN[5:]]), FEWER),
     "the end missing": (shows(SHOWN[:-1]), FEWER),
     "late, a frame twice": (shows(TWICE, 1 + np.arange(37)), LATE),
@@ -252,6 +262,24 @@ def test_tasks_in_any_form_give_each_episode_its_words(tmp_path: Path, content: 
     if content is not None:
         path.write_text(content)
     assert instructions(folder) == [TASKS[0], TASKS[1], TASKS[0]]
+
+
+def test_words_may_be_numbers_of_tasks(shared: Path) -> None:  # as the annotations of GR00T are
+    change_column(data(shared), "index", lambda _, row: int(row["episode_index"] == 1))
+    read = open_source("lerobot").read
+    said = [read(str(shared), name, robot(instruction="index")).instruction for name in EPISODES]
+    assert said == [TASKS[0], TASKS[1], TASKS[0]]
+
+
+def test_spans_may_be_whole_seconds(shared: Path) -> None:
+    make_v3(shared, (10, 10, 10))
+    path = shared / "meta/episodes/chunk-000/file-000.parquet"
+    listed = [
+        {key: int(value) if isinstance(value, float) else value for key, value in row.items()}
+        for row in pq.read_table(path).to_pylist()
+    ]
+    pq.write_table(pa.Table.from_pylist(listed), path)
+    assert outcome(shared) == ["right"] * 3
 
 
 def test_an_episode_without_words_is_flagged_and_named(tmp_path: Path) -> None:

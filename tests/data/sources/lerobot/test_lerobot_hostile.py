@@ -39,6 +39,10 @@ def a_row_less(path: Path) -> None:
     pq.write_table(pq.read_table(path).slice(1), path)
 
 
+def nameless(path: Path) -> None:
+    pq.write_table(pq.read_table(path).drop_columns(["episode_index"]), path)
+
+
 def many_rows(path: Path) -> None:
     pq.write_table(pa.table({"episode_index": [0] * 1001}), path)
 
@@ -48,6 +52,7 @@ def sees(key: str) -> dict[str, Any]:
 
 
 NO_INFO = "has no meta/info.json — give the folder of a whole LeRobotDataset"
+TOLD_BY_NUMBER = {"source__instruction": "frame_index"}
 PAIR, STILLS = [1.0, 2.0], sees(STILL)
 SIX = {"action__components": [{"key": "action", "dims": 6}]}
 ONE: dict[str, Row] = {  # one episode is refused
@@ -61,6 +66,7 @@ ONE: dict[str, Row] = {  # one episode is refused
     "rows cut short": (of(ROWS, cut(500)), r"episode_000000\.parquet: .*copy it again"),
     "a row less": (of(ROWS, a_row_less), "has 11 rows of episode_000000, its metadata says 12"),
     "more rows than can be": (of(LISTED, swap('"length": 12', f'"length": {2**63}')), "its metadata says 9"),
+    "rows of no episode": (of(ROWS, nameless), "has no column 'episode_index' — it has action"),
     "too many rows": (of(ROWS, many_rows), "'episode_index' claims 1,001 values of 1,001 rows"),
     "a list too short": (column("action", [PAIR] * 11 + [[1.0]]), "holds lists of"),
     "a row without action": (column("action", [PAIR] * 11 + [None]), "1 missing values"),
@@ -70,6 +76,11 @@ ONE: dict[str, Row] = {  # one episode is refused
     "language of numbers": (column("language_persistent", [3] * 12), "not as lerobot writes it: TypeError"),
     "language without times": (column("language_persistent", [[{"a": 1}]] * 12), "writes it: KeyError"),
     "subtasks of NaN": (column("subtask_index", [float("nan")] * 12), "not as lerobot writes it: ValueError"),
+    "words of no task": (
+        column("frame_index", [*range(7, 19)]),
+        "'frame_index' is 7, the number of no task",
+        TOLD_BY_NUMBER,
+    ),
     "pictures elsewhere": (column(STILL, [{"path": "../../etc/passwd"}] * 12), "outside the dataset", STILLS),
 }
 ALL: dict[str, Row] = {  # no episode can be used
