@@ -131,7 +131,7 @@ def convert(
     with interruptible(lambda: _kept(conversion)), _shown(robot.id) as on_progress:
         summary = conversion.run_share(share, on_progress) if share else conversion.run(on_progress)
     if isinstance(summary, UnfinishedShare):
-        _report_share(summary, share, json)
+        _report_share(summary, json)
         return
     from hma_data.inspection.shard_findings import kept_findings
     from hma_data.shards.reader import ShardSet
@@ -276,7 +276,7 @@ def _read(plan: "Plan", uri: str) -> str:
 # -- the result
 
 
-def _report_share(done: "UnfinishedShare", share: "Share | None", json: bool) -> None:
+def _report_share(done: "UnfinishedShare", json: bool) -> None:
     facts = {
         "out": str(done.out),
         "shards_made": done.made_shards,
@@ -288,9 +288,8 @@ def _report_share(done: "UnfinishedShare", share: "Share | None", json: bool) ->
         print_json(facts)
         return
     missing, made = human_count(done.missing, "shard"), human_count(done.made_shards, "shard")
-    name = f"share {share.name} " if share else ""
     say(
-        f"{done.out}: {name}made {made} ({done.kept_shards} existed already), "
+        f"{done.out}: share {done.name} made {made} ({done.kept_shards} existed already), "
         f"{human_seconds(done.seconds)}; {missing} left for other shares; the last one writes the manifest"
     )
 

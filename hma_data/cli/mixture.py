@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from typer import Argument, Option
 
-from hma_data.cli.options import Json
+from hma_data.cli.options import Json, pairs
 from hma_data.cli.shards import refuse_early
 from hma_data.console import print_json, print_table, say
 from hma_data.errors import UsageError
@@ -67,7 +67,7 @@ def mixture(
         counts,
         tau,
         weights=_numbers("--weight", weight),
-        groups=_pairs("--group", group),
+        groups=pairs("--group", group or [], "NAME=VALUE"),
         caps=_numbers("--cap", cap),
         max_epochs=max_epochs,
         samples=planned,
@@ -105,19 +105,9 @@ def _rows(
     ]
 
 
-def _pairs(option: str, words: Pairs) -> dict[str, str]:
-    pairs = {}
-    for word in words or []:
-        name, _, value = word.partition("=")
-        if not name or not value:
-            raise UsageError(option, f"must be like NAME=VALUE, is {word!r}")
-        pairs[name] = value
-    return pairs
-
-
 def _numbers(option: str, words: Pairs) -> dict[str, float]:
     numbers = {}
-    for name, text in _pairs(option, words).items():
+    for name, text in pairs(option, words or [], "NAME=VALUE").items():
         try:
             numbers[name] = float(text)
         except ValueError as fault:

@@ -13,6 +13,8 @@ from typing import Annotated, Any, Literal, get_origin
 from typer import Argument, Option
 from typer.models import OptionInfo
 
+from hma_data.errors import UsageError
+
 
 def robots(incomplete: str) -> list[str]:
     """Return the ids of the registry that begin so."""
@@ -48,6 +50,17 @@ def robot_option(text: str) -> Any:
 def choice_option(text: str, **options: Any) -> Any:
     """Return an option that chooses episodes, with its help."""
     return Option(help=f"{text}: id, glob, or @FILE with one per line; repeatable.", **options)
+
+
+def pairs(option: str, words: Iterable[str], example: str) -> dict[str, str]:
+    """Return the values of words such as NAME=VALUE by name; an error states `option` and `example`."""
+    found = {}
+    for word in words:
+        name, _, value = word.partition("=")
+        if not name or not value:
+            raise UsageError(option, f"must be like {example}, is {word!r}")
+        found[name] = value
+    return found
 
 
 def with_settings(verb: Callable[..., None]) -> Callable[..., None]:

@@ -7,9 +7,9 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from hma_data.cli.options import Json, Weights, robot_option, tokenizers
+from hma_data.cli.options import Json, Weights, pairs, robot_option, tokenizers
 from hma_data.console import human_bytes, interruptible, print_json, print_table, say
-from hma_data.errors import MissingDependencyError, RecipeError, UsageError
+from hma_data.errors import MissingDependencyError, RecipeError
 
 tokenizer_app = typer.Typer(no_args_is_help=True, help="List, train and measure tokenizers.")
 Device = Annotated[str, Option(help="Device of the network: cpu, cuda, mps.")]
@@ -67,12 +67,8 @@ def tokenizer_train(
     """
     from hma_data.storage.yaml_io import parse_yaml, read_yaml
 
-    changes = {}
-    for text in overrides or []:
-        key, equals, value = text.partition("=")
-        if not key or not equals:
-            raise UsageError(text, "is not an override", "write KEY=VALUE, for example training.steps=100")
-        changes[key] = parse_yaml(value, text, RecipeError)
+    given = pairs("KEY=VALUE", overrides or [], "training.steps=100")
+    changes = {key: parse_yaml(value, key, RecipeError) for key, value in given.items()}
 
     def kept() -> str:
         state = out.with_name(out.name + ".state")

@@ -212,7 +212,7 @@ class Conversion(Options):
                 if not missing:
                     # A journal shows that some share has made shards since the manifest was written.
                     return run.finish(plan, base, bool(run.made or known_hashes(run.out)))
-        return UnfinishedShare(run.out, run.kept, run.made, missing, time.monotonic() - run.begun)
+        return UnfinishedShare(share.name, run.out, run.kept, run.made, missing, time.monotonic() - run.begun)
 
 
 def _records(refs: Sequence[EpisodeRef]) -> Records[EpisodeRef]:

@@ -83,9 +83,11 @@ class UnfinishedShare:
     """The result of a share of a conversion that leaves shards, or the manifest, to the other shares.
 
     Attributes:
+        name: of the share.
         missing: number of shards that other shares have still to make.
     """
 
+    name: str
     out: Path
     kept_shards: int
     made_shards: int

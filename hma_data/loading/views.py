@@ -16,12 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.errors import UsageError
+from hma_data.registry.embodiment import FIRST_CAMERA
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.windows import Ints
 from hma_data.tokenizers.base import TokenizerSpec
 
 Cameras = str | Sequence[str]
-FIRST_CAMERA, DRAWN = "first", "drawn"
+DRAWN = "drawn"
 
 
 def view_count(cameras: Cameras) -> int:

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+FIRST_CAMERA = "first"  # stands for the first camera of a set, whatever its name
 ID_PATTERN = re.compile(r"[a-z0-9][a-z0-9_.-]{0,99}")
 TODO = "TODO"
 WITHOUT_STEPS = {"rosbag": "a bag has times", "rh20t": "RH20T has times (keys may end in /next)"}

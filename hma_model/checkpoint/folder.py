@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hma_data.errors import CheckpointError, HMAError
-from hma_data.registry.embodiment import ID_PATTERN, Embodiment
+from hma_data.registry.embodiment import FIRST_CAMERA, ID_PATTERN, Embodiment
 from hma_data.storage.files import file_sha256, opened_weights, read_json
 from hma_data.storage.kinds import misplaced, unreadable
 from hma_data.storage.paths import StrPath, as_path
@@ -156,7 +156,7 @@ class Checkpoint:
         stated = value_of(self.card(embodiment).get("data"), "cameras")
         names = [stated] if isinstance(stated, str) else stated
         if not (isinstance(names, list) and names and all(isinstance(name, str) for name in names)):
-            return "first"
+            return FIRST_CAMERA
         if len(names) != self.config.views:
             fault = f"names {len(names)} cameras, but a frame of the model has {self.config.views}"
             raise CheckpointError(self.path(embodiment, CARD), fault, "pull or save the checkpoint again")

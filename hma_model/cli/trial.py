@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 from typer import Argument, Option
 
-from hma_data.cli.options import choice_option, robot_option
+from hma_data.cli.options import choice_option, pairs, robot_option
 from hma_data.console import CONTINUE, say
 from hma_data.cpu import usable_cores
 from hma_data.errors import EpisodeError, Interrupted, RegistryError, UsageError
@@ -138,11 +138,8 @@ def _answer(path: Path, given: list[str]) -> None:
     from hma_data.storage.yaml_io import parse_yaml, read_yaml, write_yaml
 
     values = read_yaml(path)
-    for word in given:
-        key, equals, text = word.partition("=")
-        if not equals:
-            raise UsageError("--answer", f"{word!r} is not KEY=VALUE", "write for example kind=real")
-        _set(values, key, parse_yaml(text, word, UsageError))
+    for key, text in pairs("--answer", given, "kind=real").items():
+        _set(values, key, parse_yaml(text, f"{key}={text}", UsageError))
     open_questions = []
     for key, question in todos(values):
         whole_image = key == "provenance.crop" and sys.stdin.isatty() and _denied(question)

@@ -121,8 +121,8 @@ class WorldModelEnv(gymnasium.Env[Images, Float32s]):
             raise UsageError("embodiment", "is not given", f"give embodiment=ID; the model has: {there}")
         if control not in CONTROLS:
             raise UsageError("control", f"{control!r} is unknown", f"give {' or '.join(CONTROLS)}")
-        if size is not None and size < 1:
-            raise UsageError("size", f"is {size}", "give 1 or more pixels, or leave it out")
+        if size is not None and (not isinstance(size, int | np.integer) or size < 1):
+            raise UsageError("size", f"is {size}", "give a whole number of pixels, or leave it out")
         if size is not None and world.image_shape[0] != world.image_shape[1]:
             raise UsageError("size", "is for models of one view", "leave it out")
         self.world = world
@@ -267,8 +267,8 @@ class WorldModelVectorEnv(VectorEnv[Images, Float32s, NDArray[Any]]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         **settings: Any,
     ) -> None:
-        if num_envs < 1:
-            raise UsageError("num_envs", f"is {num_envs}", "give 1 or more")
+        if not isinstance(num_envs, int | np.integer) or num_envs < 1:
+            raise UsageError("num_envs", f"is {num_envs}", "give a whole number of 1 or more")
         first = WorldModelEnv(*others, **settings)
         # copies made before any session is open: they share the world, its prompts and the warnings
         self.envs = [first, *(copy.copy(first) for _ in range(num_envs - 1))]

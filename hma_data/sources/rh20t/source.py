@@ -269,7 +269,7 @@ class Rh20tSource:
 
     def episode_ids(self, uri: StrPath) -> list[str]:
         """Return the scenes' paths below the uri."""
-        return list(self._scenes(as_text(uri)))
+        return list(self._list(as_text(uri)))
 
     def index(self, uri: StrPath, embodiment: Embodiment | None = None) -> list[EpisodeRef]:
         """Return the scenes, with an estimate of their frames. `read` refuses those that are not whole.
@@ -279,7 +279,7 @@ class Rh20tSource:
         """
         return [
             EpisodeRef(name, _estimate(folder, embodiment), None, _fingerprint(folder, embodiment))
-            for name, folder in self._scenes(as_text(uri)).items()
+            for name, folder in self._list(as_text(uri)).items()
         ]
 
     def read(self, uri: StrPath, episode_id: str, embodiment: Embodiment) -> Episode:
@@ -289,7 +289,9 @@ class Rh20tSource:
             EpisodeError: a film, table or field is missing or damaged, or a film has more frames than times.
             SourceError: no such scene.
         """
-        found = self._scenes(as_text(uri))
+        found = self._found.get(as_text(uri), {})  # listed once, for all scenes of a conversion
+        if episode_id not in found:
+            found = self._list(as_text(uri))
         if episode_id not in found:
             known = ", ".join(list(found)[:3])
             raise SourceError(
@@ -318,9 +320,8 @@ class Rh20tSource:
             },
         )
 
-    def _scenes(self, uri: str) -> dict[str, Path]:
-        if uri not in self._found:
-            self._found[uri] = scenes(uri)
+    def _list(self, uri: str) -> dict[str, Path]:
+        self._found[uri] = scenes(uri)
         return self._found[uri]
 
 

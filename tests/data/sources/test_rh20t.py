@@ -68,11 +68,12 @@ def test_a_rating_tells_success(rating, success, tmp_path):
 
 
 def test_scenes_are_found_in_nested_folders_and_films_of_people_are_not(recording):
+    source = open_source("rh20t")
+    assert source.episode_ids(recording) == [SCENE]
     write_scene(recording, 2)
     shutil.copytree(recording / SCENE, recording / f"{SCENE}_human")
     other = recording.parent / "RH20T_cfg2"
     shutil.copytree(recording, other)
-    source = open_source("rh20t")
     second = SCENE.replace("0001", "0002", 1)
     assert source.episode_ids(recording) == [SCENE, second]
     assert source.episode_ids(recording.parent) == [

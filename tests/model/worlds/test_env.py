@@ -257,7 +257,8 @@ def test_an_action_that_is_refused_leaves_no_environment_of_a_vector_ahead(world
         ({"embodiment": None}, "embodiment: is not given — give embodiment=ID; the model has: pusht_fast"),
         ({"embodiment": "ur5"}, "ur5: is not in the model"),
         ({"control": "second"}, "'second' is unknown — give frame or chunk"),
-        ({"size": 0}, "size: is 0 — give 1 or more pixels"),
+        ({"size": 0}, "size: is 0 — give a whole number of pixels"),
+        ({"size": 64.5}, "size: is 64.5 — give a whole number of pixels"),
     ],
 )
 def test_bad_settings_are_refused(world: World, change: dict[str, Any], message: str) -> None:
@@ -265,9 +266,10 @@ def test_bad_settings_are_refused(world: World, change: dict[str, Any], message:
         WorldModelEnv(**{"embodiment": PUSH, "world": world, **change})
 
 
-def test_a_vector_of_no_environments_is_refused(world: World) -> None:
-    with pytest.raises(HMAError, match="num_envs: is 0 — give 1 or more"):
-        WorldModelVectorEnv(0, embodiment=PUSH, world=world)
+@pytest.mark.parametrize("count", [0, 1.5])
+def test_a_vector_of_no_whole_number_of_environments_is_refused(world: World, count: Any) -> None:
+    with pytest.raises(HMAError, match=f"num_envs: is {count} — give a whole number of 1 or more"):
+        WorldModelVectorEnv(count, embodiment=PUSH, world=world)
 
 
 def test_a_gray_image_is_refused_with_its_shape(world: World) -> None:
