@@ -12,7 +12,8 @@ import numpy as np
 from hma_data.errors import OutputError, UsageError
 from hma_data.storage.files import write_atomic
 from hma_data.tables import Table
-from hma_model.evaluation.intervals import interval, rounded
+from hma_model.benchmark.planning import difference
+from hma_model.evaluation.intervals import ends_of, interval
 from hma_model.evaluation.pages import Page
 from hma_model.evaluation.plots import COLOURS, MARKERS, label_axes, svg_bytes
 from hma_model.evaluation.tables import value
@@ -247,6 +248,7 @@ def _difference(one: list[Any] | None, other: list[Any] | None) -> str:
     """Return the mean difference of the same scenes with its interval."""
     if not one or not other or None in one or None in other:
         return ""
-    change = np.subtract(other, one)
-    ends = rounded(interval(change))
-    return _shown(float(change.mean()), None if None in ends else ends)
+    first, second = np.array(one), np.array(other)
+    if np.isin([first, second], (0, 1)).all():  # a bootstrap of outcomes that all agree would be certain
+        return _shown(*difference(second == 1, first == 1))
+    return _shown(float((second - first).mean()), ends_of(interval(second - first)))

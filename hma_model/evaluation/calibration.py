@@ -22,7 +22,8 @@ from scipy.optimize import isotonic_regression
 
 from hma_model.arrays import Bools, Floats, Ints
 from hma_model.config import HMAConfig
-from hma_model.evaluation.intervals import LEVELS, NATURAL, SHARE, resampled_means, rounded, summary
+from hma_model.evaluation.agreement import independent, share_interval
+from hma_model.evaluation.intervals import LEVELS, NATURAL, resampled_means, rounded, summary
 
 POWER = 4
 LEAD_FRAMES = 5
@@ -90,7 +91,7 @@ class Meter:
         """Return in a sentence how good it is."""
         rates = f"{self.right:.0%} of rollouts are warned in time, a clock warns {self.clock:.0%}"
         if not self.better:
-            return f"uncertainty is no better than a clock: {rates}"
+            return f"uncertainty may be no better than a clock: {rates}"
         shares = {"misses": self.misses, "false alarms": self.false_alarms}
         said = [f"{name} {value:.0%}" for name, value in shares.items() if value is not None]
         start = f"uncertainty warns of a state error of {self.doubled_px:.1f} px: {rates}"
@@ -296,20 +297,20 @@ def _half_gain(unsure: Floats, values: Floats, seed: int) -> dict[str, Any]:
 
 def _warnings(warned: Ints, clock: Ints, doubled: Ints, frames: int, seed: int) -> dict[str, Any]:
     """Return the rates of warnings (N, C) of a meter and of a clock."""
-    right = warned_rightly(warned, doubled, frames).astype(float)
-    timed = warned_rightly(clock, doubled, frames).astype(float)
+    right = warned_rightly(warned, doubled, frames)
+    timed = warned_rightly(clock, doubled, frames)
     found = {"lead_frames": LEAD_FRAMES, "doubling": rounded((doubled < frames).mean())}
-    found |= summary("right", right.mean(axis=1), seed, within=SHARE)
-    found |= summary("clock", timed.mean(axis=1), seed, within=SHARE)
-    found |= summary("gain", (right - timed).mean(axis=1), seed)
-    scenes = np.broadcast_to(np.arange(len(warned))[:, None], warned.shape)
-    wrong = {
+    found |= summary("gain", (right.astype(float) - timed).mean(axis=1), seed)
+    every = np.ones_like(warned, bool)
+    rates = {
+        "right": (every, right),
+        "clock": (every, timed),
         "misses": (doubled < frames, warned > doubled),
         "false_alarms": (warned < frames, (doubled == frames) | (doubled - warned > LEAD_FRAMES)),
     }
-    for name, (among, seen) in wrong.items():
+    for name, (among, seen) in rates.items():
+        found |= {name: None, f"{name}_95": None}
         if among.any():
-            found |= summary(name, seen[among].astype(float), seed, episodes=scenes[among], within=SHARE)
-        else:
-            found |= {name: None, f"{name}_95": None}
+            ends = share_interval(*independent(seen.T, among.T))  # a bootstrap of none of few is certain
+            found |= {name: rounded(seen[among].mean()), f"{name}_95": rounded(np.array(ends))}
     return found

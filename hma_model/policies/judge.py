@@ -224,7 +224,7 @@ def train_judge(
         rare = found.too_few
         factor = 0.5 if rare and (task.name == "moved") == (rare == "successes") else 2
         remedy = f"try another task or limit, such as --judge {task.name}={factor * abs(task.limit):g}"
-        raise HMAError(f"judge of {robot}", f"is no better than chance: {found}", remedy)
+        raise HMAError(f"judge of {robot}", f"may be no better than chance: {found}", remedy)
     return replace(judge, limit=limit, held_out=found)
 
 

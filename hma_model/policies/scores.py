@@ -171,7 +171,7 @@ class PolicyEvaluation:
                 return "the judge may be no better than chance; more episodes would tell"
             return "the judge is no better than chance"
         if self.followed.low is not None and self.followed.low <= 0:
-            return "the per-episode scores agree with the simulator's no better than chance"
+            return "the per-episode scores may agree with the simulator's no better than chance"
         return ""
 
     def alike(self, where: int) -> list[tuple[str, str]]:
@@ -330,7 +330,7 @@ def choosing_meter(world: World, embodiment: str) -> Meter:
     """
     meter, reason = world.meter(embodiment)
     if meter is not None and not meter.chooses:
-        reason = f"the least uncertain half of {embodiment}'s rollouts has no smaller error than all of them"
+        reason = f"the least uncertain half of {embodiment}'s rollouts may err no less than all of them"
     if meter is None or reason:
         raise UsageError("--max-error", reason, "leave it out")
     return meter

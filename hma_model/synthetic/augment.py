@@ -237,7 +237,7 @@ def _warn_of_choice(world: World, settings: Augmentation) -> None:
     """Warn if nobody knows that the surest episodes are better than others."""
     meter, reason = world.meter(settings.embodiment)
     if meter is not None and not meter.chooses:
-        reason = "uncertainty chooses no better than chance on this robot"
+        reason = "uncertainty may choose no better than chance on this robot"
     if reason and world.model.config.video_loss != "regression":  # of which the command says more
         warnings.warn(f"--keep {settings.keep:g}: {reason}", UserWarning, stacklevel=3)
 

@@ -82,7 +82,7 @@ def test_warnings_are_what_plain_loops_compute_and_a_meter_that_knows_nothing_is
     kept = Meter.of(found["meter"])
     assert kept.better == (told > 0) and ("no better than a clock" in kept.verdict) == (told == 0)
     if told:
-        assert found["right"] > 0.95 and found["misses"] == 0
+        assert found["right"] > 0.95 and found["misses"] == 0 < found["misses_95"][1]
         assert kept.expected(np.array([1.0, 9.0])) == pytest.approx([1.05, 7.05], abs=0.2)
         assert 0 <= (errors[0, 0] > 2).argmax() - kept.warns(stated[0, 0]).argmax() <= LEAD_FRAMES
 

@@ -242,7 +242,7 @@ def test_a_model_abstains_where_it_expects_a_large_error_of_its_own(judge, monke
     assert evaluation(judge, policies).abstention is None
     for meter, said in (
         ((None, "it is not calibrated"), "not calibrated"),
-        ((UNABLE, ""), "no smaller error"),
+        ((UNABLE, ""), "may err no less"),
     ):
         monkeypatch.setattr(FlawlessWorld, "meter", lambda self, robot, meter=meter: meter)
         world: Any = FlawlessWorld(World(tiny_model(ROBOT), get_tokenizer("fsq-8")))
