@@ -285,7 +285,7 @@ def often(patch: pytest.MonkeyPatch) -> None:
 
 
 def known_error(patch: pytest.MonkeyPatch) -> None:
-    error = labels.LabelError("s", "val", ("a",), (0.1,), (1.0,), 9)
+    error = labels.LabelError("s", "val", ("a",), (0.1,), (1.0,), (None,), 9)
     patch.setattr(labels, "measure", lambda *given: error)
     patch.setattr(labels, "_check_set", lambda *given: None)
 

@@ -11,7 +11,7 @@ import fcntl
 import os
 import shutil
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
@@ -106,6 +106,15 @@ class ShardSet:
             text = f"names {min(map(str, other))!r}, which is no shard of the manifest"
             raise ShardError(path, text, restat_remedy(self.folder))
         return table
+
+    def recordings(self, episodes: Iterable[int]) -> NDArray[np.int64]:
+        """Return the number of the recording of each of some episodes, which those of one group share."""
+        known = dict[tuple[str, str], int]()
+        own = {}
+        for row in self.episodes.select(["episode_index", "group", "id"]).to_pylist():
+            name = row["group"], row["group"] or row["id"]
+            own[row["episode_index"]] = known.setdefault(name, len(known))
+        return np.array([own[int(episode)] for episode in episodes], np.int64)
 
     def refused(self) -> list[dict[str, Any]]:
         """Read quarantine.jsonl; return one mapping for each refused episode."""

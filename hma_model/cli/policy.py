@@ -225,11 +225,19 @@ def label_actions(
     if json:
         print_json({"out": str(out), "splits": made.manifest.splits, "plan": made.manifest.plan})
         return
-    say(f"error on {error.commands:,} actions of {error.source} ({error.split}):")
-    for name, rmse, share in zip(error.names, error.rmse, error.explained, strict=True):
-        said = "does not vary there" if share is None else f"{share:.0%} of the variance explained"
-        worse = "; no better than the mean: do not use it" if share is not None and share <= 0 else ""
-        say(f"  {name}: RMSE {rmse:.3g}, {said}{worse}")
+    seen = ", which the model may have learned from" if error.split == "train" else ""
+    say(f"error on {error.commands:,} actions of {error.source} ({error.split}){seen}:")
+    columns = error.names, error.rmse, error.explained, error.explained_95
+    for name, rmse, share, ends in zip(*columns, strict=True):
+        said = "does not vary there"
+        if share is not None:
+            bounds = f"95 % CI {ends[0]:.0%} to {ends[1]:.0%}" if ends else "one recording, no CI"
+            said = f"{share:.0%} of the variance explained ({bounds})"
+            if share <= 0:
+                said += "; no better than the mean: do not use it"
+            elif not ends or ends[0] <= 0:
+                said += "; perhaps no better than the mean"
+        say(f"  {name}: RMSE {rmse:.3g}, {said}")
     made_of = human_count(sum(split["episodes"] for split in splits), "episode")
     say(f"{before}{made_of} in {out}; inferred_actions: true in every file")
     if made.manifest.quarantined:

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from scipy import stats
 from scipy.special import betaincinv
 
-from hma_model.arrays import Bools, Floats
+from hma_model.arrays import Bools, Floats, Ints
 
 RESAMPLES = 2000
 MIN_POLICIES, MIN_EPISODES = 3, 8  # fewer say nothing about a correlation
@@ -183,7 +183,7 @@ def _too_little(*judged: Floats) -> str:
 
 
 def accuracy(true: Bools, judged: Bools, among: Bools | None = None) -> Accuracy:
-    """Return how often judgements are right: (M, N), or (N,) of independent episodes.
+    """Return how often judgements (M, N) are right, or (N,) of independent episodes.
 
     `among` (M, N) are those that count, by default all; at least one does.
     """
@@ -236,6 +236,19 @@ def independent(hits: Bools, among: Bools) -> tuple[float, float]:
     by_chance = share * (1 - share) * of_scenes.sum()
     effect = max(float(np.square(in_scenes - share * of_scenes).sum() / by_chance), 1.0)
     return float(found.sum()) / effect, float(sizes.sum()) / effect
+
+
+def by_scene(scenes: Ints, *judged: Bools) -> list[Bools]:
+    """Return judgements (N,) by their scenes (N,) as (M, scenes), and last which of these places are taken.
+
+    M is the largest number of a scene.
+    """
+    _, own, counts = np.unique(scenes, return_inverse=True, return_counts=True)
+    kept = np.arange(counts.max())[:, None] < counts
+    tables = [np.zeros_like(kept) for _ in judged]
+    for table, values in zip(tables, judged, strict=True):
+        table.T[kept.T] = values[np.argsort(own, kind="stable")]
+    return [*tables, kept]
 
 
 def share_interval(successes: float, count: float) -> tuple[float, float]:

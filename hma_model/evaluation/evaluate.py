@@ -3,7 +3,8 @@
 A rollout continues from its own predictions. Rollouts are made with the true actions, with shuffled ones
 (those of another window) and with none; `copy` repeats the last frame of the prompt. The difference shows how
 much the model uses the actions. Which window gets which actions is drawn several times, and the figures of
-shuffled actions are means over the draws. `KEY_95` is the 95 % interval of the mean KEY over windows.
+shuffled actions are means over the draws. `KEY_95` is the 95 % interval of the mean KEY over windows, by
+whole recordings.
 
 The protocol of the paper's evaluation, on request: the last frame alone is predicted, from all true frames
 before it, once with the true actions and in several draws with Gaussian ones.
@@ -151,10 +152,11 @@ def measure(
     """Compute a model's figures on one shard set; rollouts are compared with the decoded true tokens.
 
     `found` has `loss` (nats a token); for discrete models also `shuffled_loss` (given another window's
-    actions), `baseline_loss`, `perplexity`, `accuracy`, and both of `masked_scores`. For the rollouts `true`,
-    `shuffled`, `none` and `copy` it has what `figures_of` gives. `psnr_action_gain_last` is `psnr_last`
-    of true minus that of shuffled. `unmoved_windows` counts those whose true images never change. `notes`
-    says what else must be known, and `missing` why a metric is absent.
+    actions), `loss_action_gain` (by how much that is higher), `baseline_loss`, `perplexity`, `accuracy`, and
+    both of `masked_scores`. For the rollouts `true`, `shuffled`, `none` and `copy` it has what `figures_of`
+    gives. `psnr_action_gain_last` is `psnr_last` of true minus that of shuffled. `unmoved_windows` counts
+    those whose true images never change. `notes` says what else must be known, and `missing` why a metric is
+    absent.
 
     Args:
         model: a model that has the embodiment of the shard set.
@@ -177,7 +179,8 @@ def measure(
     if not model.config.sees_actions:  # it knows only how frames without actions go on
         batches = [without_actions(batch) for batch in batches]
     episodes = episodes_of(batches)
-    table, by_window = _losses(model, shards, batches, episodes, plan.cameras, draws, seed)
+    recordings = shards.recordings(episodes)  # windows of one resemble each other
+    table, by_window = _losses(model, shards, batches, recordings, plan.cameras, draws, seed)
     on_frames(0)  # the losses are done: the clock of the time left starts here
     predicted = 0
 
@@ -198,13 +201,13 @@ def measure(
     gain = by_window["true.psnr_last"] - by_window["shuffled.psnr_last"]
     by_window["psnr_action_gain_last"] = gain
     frechet, missing = rolled.judge.figures(plan.frames - first)
-    count, distinct = len(gain), len(np.unique(episodes))
+    count, distinct = len(gain), len(np.unique(recordings))
     figures = {
-        kind: figures_of(joined[kind], seed, episodes) | frechet.get(kind, {}) for kind in ROLLOUT_KINDS
+        kind: figures_of(joined[kind], seed, recordings) | frechet.get(kind, {}) for kind in ROLLOUT_KINDS
     }
     extra: dict[str, Any] = {}
     if settings.paper:
-        extra["paper"] = _paper(roll, batches, episodes, shards, by_window, draws, seed)
+        extra["paper"] = _paper(roll, batches, recordings, shards, by_window, draws, seed)
     else:
         missing = {**missing, "paper": "not measured: --paper follows the paper's protocol"}
     found = {
@@ -212,7 +215,8 @@ def measure(
         "split": settings.split,
         "windows": count,
         "unmoved_windows": rolled.still,
-        "episodes": distinct,
+        "episodes": len(np.unique(episodes)),
+        "recordings": distinct,
         "frames": plan.frames,
         "prompt": first,
         "draws": draws,
@@ -222,13 +226,13 @@ def measure(
         "cameras": plan.cameras if isinstance(plan.cameras, str) else ", ".join(plan.cameras),
         **table,
         **figures,
-        **summary("psnr_action_gain_last", gain, seed, 6, episodes, PSNR_GAIN_RANGE),
+        **summary("psnr_action_gain_last", gain, seed, 6, recordings, PSNR_GAIN_RANGE),
         **extra,
         "missing": missing,
         "notes": _notes(model, joined, table, rolled.still, count, distinct),
         "seconds_a_frame": round(1 / shards.embodiment.effective_hz, 6),
     }
-    by_window["episode"] = episodes.astype(np.float64)
+    by_window["recording"] = recordings.astype(np.float64)
     return Measured(found, by_window, batches, rolled.predicted)
 
 
@@ -236,7 +240,7 @@ def _losses(
     model: HMA,
     shards: ShardSet,
     batches: list[Batch],
-    episodes: Ints,
+    recordings: Ints,
     cameras: Cameras,
     draws: int,
     seed: int,
@@ -244,7 +248,7 @@ def _losses(
     """Return the losses, and by the name of each the values (N,) of the windows."""
     if model.config.kind == "continuous":
         loss = np.array(validation_losses(model, batches)[0].samples)
-        return summary("loss", loss, digits=6, episodes=episodes, within=NATURAL), {"loss": loss}
+        return summary("loss", loss, digits=6, episodes=recordings, within=NATURAL), {"loss": loss}
     nats, hits = _joined(teacher_forced(model, batch.to(model.device)) for batch in batches)
     masked = []
     for number, batch in enumerate(batches):
@@ -252,19 +256,22 @@ def _losses(
         masked.append(masked_scores(model, batch.to(model.device), drawn))
     masked_nats, masked_hits = _joined(masked)
     other = (shuffled(batch, seed=seed, draw=draw) for draw in range(draws) for batch in batches)
+    shuffled_loss = np.reshape(validation_losses(model, other)[0].samples, (draws, -1)).mean(axis=0)
     by_window = {"loss": nats.mean(axis=1), "accuracy": hits.mean(axis=1)}
     by_window |= {"masked_loss": masked_nats, "masked_accuracy": masked_hits}
-    table = summary("loss", by_window["loss"], seed, 6, episodes, NATURAL) | {
-        "shuffled_loss": validation_losses(model, other)[0].mean(),
+    table = summary("loss", by_window["loss"], seed, 6, recordings, NATURAL) | {
+        "shuffled_loss": shuffled_loss.mean(),
         "baseline_loss": unconditional_baseline([shards], batches, model.config, cameras).mean(),
     }
+    gain = shuffled_loss - by_window["loss"]
+    table |= summary("loss_action_gain", gain, seed, 6, recordings)
     if table["loss"] is not None:  # a model that takes squares of tokens as one has a loss of squares
         table["stored_loss"] = round(table["loss"] / model.config.merge**2, 6)
-    table |= perplexity_summary("perplexity", by_window["loss"], seed, episodes)
-    table |= summary("accuracy", by_window["accuracy"], seed, 6, episodes, SHARE)
-    table |= perplexity_summary("masked_perplexity", masked_nats, seed, episodes)
+    table |= perplexity_summary("perplexity", by_window["loss"], seed, recordings)
+    table |= summary("accuracy", by_window["accuracy"], seed, 6, recordings, SHARE)
+    table |= perplexity_summary("masked_perplexity", masked_nats, seed, recordings)
     finite = np.isfinite(masked_hits)
-    table |= summary("masked_accuracy", masked_hits[finite], seed, 6, episodes[finite], SHARE)
+    table |= summary("masked_accuracy", masked_hits[finite], seed, 6, recordings[finite], SHARE)
     table |= {"loss_by_frame": rounded(nats.mean(axis=0)), "accuracy_by_frame": rounded(hits.mean(axis=0))}
     return table, by_window
 
@@ -278,7 +285,7 @@ def _joined(pairs: Iterable[tuple[torch.Tensor, torch.Tensor]]) -> tuple[Floats,
 def _paper(
     roll: Callable[..., RolloutImages],
     batches: list[Batch],
-    episodes: Ints,
+    recordings: Ints,
     shards: ShardSet,
     by_window: dict[str, Floats],
     draws: int,
@@ -298,7 +305,7 @@ def _paper(
         scores["gaussian"].append(combined(others, partial(np.mean, axis=0)))
     true_db, gaussian_db = (combined(parts)["psnr"][:, 0] for parts in scores.values())
     by_window["paper.delta_psnr"] = true_db - gaussian_db
-    mean = partial(summary, seed=seed, episodes=episodes)
+    mean = partial(summary, seed=seed, episodes=recordings)
     found = mean("psnr_last", true_db, within=PSNR_RANGE)
     found |= mean("gaussian_psnr_last", gaussian_db, within=PSNR_RANGE)
     found |= mean("delta_psnr", true_db - gaussian_db, within=PSNR_GAIN_RANGE) | {"draws": draws}
@@ -310,9 +317,9 @@ def _paper(
 
 
 def _notes(
-    model: HMA, joined: Mapping[str, Scores], table: Mapping[str, Any], still: int, count: int, episodes: int
+    model: HMA, joined: Mapping[str, Scores], table: Mapping[str, Any], still: int, count: int, whole: int
 ) -> list[str]:
-    """Return what must be known to read the figures; `count` windows are of so many episodes."""
+    """Return what must be known to read the figures; `count` windows are of `whole` recordings."""
     notes, config = [], model.config
     if config.kind == "discrete" and config.merge > 1:
         square = f"square of {config.merge}×{config.merge} tokens"
@@ -337,9 +344,9 @@ def _notes(
     blind = any(not OBJECTIVES[name].sees_actions for name, often in config.objectives.items() if often)
     if not blind:
         notes.append("the model was not trained without actions, so its rollouts without actions may be poor")
-    if episodes == 1:
+    if whole == 1:
         notes.append(
-            "all windows come from one episode, so no figure has an interval: convert more episodes, or use "
-            "a larger --val-fraction"
+            "all windows come from one recording, so no figure has an interval: convert more of them, or "
+            "use a larger --val-fraction"
         )
     return notes

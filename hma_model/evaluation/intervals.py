@@ -1,7 +1,7 @@
 """Give means their uncertainty: 95 % intervals by bootstrap, over windows and over datasets.
 
 A mean over windows is resampled 1,000 times (Efron 1979); the interval holds the middle 95 % of the means.
-Windows of one episode overlap and resemble each other, so whole episodes are drawn where they are known
+Windows of one recording resemble each other, so whole recordings are drawn where they are known
 (Davison and Hinkley 1997, 3.8). The means of few episodes spread less than they should: their distances from
 the mean are stretched by Student's t over the normal distribution's quantile and by √(n / (n − 1)), as in
 Hesterberg's expanded percentile interval (2015, 4.3): 9 times for n = 2, 1.2 for 10, 1.02 for 100. Of a

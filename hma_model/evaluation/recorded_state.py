@@ -164,7 +164,7 @@ def measure_recorded_state(
             errors.setdefault(kind, []).append(found_errors)
     joined = {kind: np.concatenate(parts) for kind, parts in errors.items()}
     kept = np.isfinite(joined["copy"]).all(axis=(1, 2))
-    whose = episodes_of(batches)
+    recordings = shards.recordings(episodes_of(batches))
     if not kept.any():
         return missing("the states of all windows are unknown in part")
     here = joined["reconstruction"][kept].mean(axis=(0, 1))  # the windows may be unlike what it learned from
@@ -184,7 +184,7 @@ def measure_recorded_state(
     }
     for kind, part in joined.items():
         of_values = part[kept].mean(axis=-1)
-        found[kind] = horizon_summary("error_sd", of_values, seed, episodes=whose[kept], within=NATURAL)
+        found[kind] = horizon_summary("error_sd", of_values, seed, episodes=recordings[kept], within=NATURAL)
     return found, joined["true"][:, -1].mean(axis=-1)
 
 

@@ -75,7 +75,7 @@ def page(parts: Sequence[Part], command: str) -> str:
     _headline(made, parts)
     made.section("Does it follow its actions?")
     made.definitions([(_whose(part, parts), verdict(part.found)) for part in parts])
-    made.section("Figures", "Below a figure: the 95 % interval of its mean, by bootstrap of whole episodes.")
+    made.section("Figures", "Below a figure: the 95 % interval of its mean, by bootstrap of recordings.")
     table = turned(parts)
     made.table(table.columns, table.rows)
     if said := absences(parts):

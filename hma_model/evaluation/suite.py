@@ -43,7 +43,7 @@ from hma_model.evaluation.verdict import follows, verdict
 from hma_model.generation.decode import model_for
 from hma_model.network.model import HMA
 
-FIGURES_VERSION = 7  # raise it when the same part gives other figures
+FIGURES_VERSION = 8  # raise it when the same part gives other figures
 PARTS, RESULTS = "parts", "results.json"
 
 

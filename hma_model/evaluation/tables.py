@@ -148,9 +148,9 @@ def means(parts: Sequence[Part]) -> list[dict[str, Any]]:
             if not figure.by_window:
                 row[figure.path] = round(sum(of_sets) / len(of_sets), 4)
                 continue
-            episodes = [part.by_window["episode"] for part in own]
+            recordings = [part.by_window["recording"] for part in own]
             values = [part.by_window[figure.by_window] for part in own]
-            mean, ends = over_datasets(values, episodes=episodes, within=figure.within)
+            mean, ends = over_datasets(values, episodes=recordings, within=figure.within)
             scaled = perplexity if figure.exponential else float
             row[figure.path] = round(scaled(mean), 4)
             row[f"{figure.path}_95"] = ends and [round(scaled(end), 4) for end in ends]
@@ -242,7 +242,7 @@ def markdown(parts: Sequence[Part], command: str) -> str:
     """Return the content of results.md."""
     table = comparison(parts)
     text = ["# Evaluation", "", f"`{command}`", "", table.markdown(), ""]
-    text += ["In brackets: 95 % intervals, by bootstrap of whole episodes (1,000 resamples).", ""]
+    text += ["In brackets: 95 % intervals, by bootstrap of whole recordings (1,000 resamples).", ""]
     text += [*(f"- {whose} {said}" for whose, said in verdicts(parts)), ""]
     text += [f"- {name}: {MEANINGS[name]}" for name in table.columns if name in MEANINGS]
     if said := absences(parts):

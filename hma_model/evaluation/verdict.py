@@ -2,7 +2,9 @@
 
 The measure is the PSNR gain of a rollout's last frame, recorded vs shuffled actions. A model follows its
 actions if the mean gain is FOLLOWS_DB or more and its 95 % interval lies above 0. It does not if the interval
-ends below FOLLOWS_DB. The interval is over held-out episodes, so one episode gives no verdict.
+ends below FOLLOWS_DB. The interval is over held-out recordings, so one recording gives no verdict. A model
+that does not follow is sensitive if shuffled actions raise its loss to SENSITIVE times or more, and the 95 %
+interval of the increase lies above 0.
 """
 
 from collections.abc import Mapping
@@ -13,7 +15,7 @@ from hma_model.config import token_words
 
 FOLLOWS_DB = 0.5  # least mean PSNR gain of the last frame
 SENSITIVE = 1.2  # least ratio of the losses with shuffled and recorded actions for a sensitive model
-FEW_EPISODES = 5  # with fewer, the verdict says "only"
+FEW_RECORDINGS = 5  # with fewer, the verdict says "only"
 
 
 def follows(found: Mapping[str, Any]) -> bool:
@@ -35,7 +37,8 @@ def verdict(found: Mapping[str, Any]) -> str:
     if not ends or max(found["psnr_action_gain_last"], ends[1]) >= FOLLOWS_DB:  # the gain may be as large
         return f"may follow its actions (inconclusive): {said}"
     loss, shuffled_loss = found.get("loss"), found.get("shuffled_loss")
-    if loss and shuffled_loss and shuffled_loss >= SENSITIVE * loss:
+    gained = found.get("loss_action_gain_95")
+    if loss and gained and shuffled_loss >= SENSITIVE * loss and gained[0] > 0:
         unit = token_words(found.get("merge") or 1)
         nats = f"loss {loss:.2f} nats per {unit}, {shuffled_loss:.2f} with shuffled actions"
         return f"is sensitive to its actions ({nats}), but its rollouts do not follow them yet: {said}"
@@ -64,10 +67,13 @@ def _measured(found: Mapping[str, Any]) -> str:
     """Return the gain with its interval, horizon and episodes in words."""
     seconds, ends = horizon(found), found.get("psnr_action_gain_last_95")
     count = found.get("episodes", 0)
+    recordings = found.get("recordings", count)
     after = "" if seconds is None else f", {seconds:.1f} s after the prompt"
     bounds = f"95 % CI {ends[0]:+.1f} to {ends[1]:+.1f}" if ends else "no CI"
     gain = f"last-frame PSNR gain {found['psnr_action_gain_last']:+.1f} dB ({bounds})"
-    few = "only " if count < FEW_EPISODES else ""
+    few = "only " if recordings < FEW_RECORDINGS else ""
     held_out = "held-out " if found.get("split", "val") == "val" else ""
     episodes = f"{few}{human_count(count, f'{held_out}episode')}"
+    if recordings < count:
+        episodes += f" of {human_count(recordings, 'recording')}"
     return f"{gain}, recorded vs shuffled actions{after}, {episodes}"

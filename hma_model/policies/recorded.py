@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.console import print_table
+from hma_data.console import human_count, print_table
 from hma_data.episodes.sheets import grid, png_bytes
 from hma_data.errors import UsageError
 from hma_data.shards.reader import ShardSet
@@ -77,7 +77,7 @@ class ModelEvaluation:
     """Policies scored in the model alone.
 
     Attributes:
-        beginnings: recorded episodes whose first frames the N episodes begin with.
+        beginnings: recordings whose frames the N episodes begin with; the first ones of as many differ.
     """
 
     embodiment: str
@@ -96,7 +96,7 @@ class ModelEvaluation:
             {
                 "policy": one.policy,
                 "model_success": float(one.success.mean()),
-                "model_success_interval": share_interval(round(one.success.mean() * count), count),
+                "model_success_interval": share_interval(one.success.mean() * count, count),
                 "model_score": float(one.scores.mean()),
             }
             for one in self.policies
@@ -120,7 +120,7 @@ class ModelEvaluation:
         pairs = alike_pairs(np.stack([one.success[: self.beginnings] for one in self.policies]))
         names = [f"{self.policies[one].policy} and {self.policies[other].policy}" for one, other in pairs]
         alike = [f"not distinguishable by success: {'; '.join(names)}"] if names else []
-        success = "success: the judge scores some frame above 0.5; 95 % intervals over recorded starts"
+        success = "success: the judge scores some frame above 0.5; 95 % intervals over recordings"
         return [success, self.judge.sentence, UNKNOWN, *alike]
 
     def table(self) -> list[list[Any]]:
@@ -186,7 +186,9 @@ def evaluate_recorded(
 
 
 def recorded_beginnings(world: World, scenes: Scenes, shards: ShardSet) -> tuple[Beginning, int]:
-    """Return the first frames of held-out episodes in turn, one for each scene, and how many there are.
+    """Return the first frames of held-out episodes in turn, one for each scene, and of how many recordings.
+
+    The first episodes are of different recordings.
 
     Raises:
         UsageError: no held-out episode is long enough.
@@ -197,6 +199,10 @@ def recorded_beginnings(world: World, scenes: Scenes, shards: ShardSet) -> tuple
     if not rows:
         fault = f"has no held-out episode of {count} frames without a pause"
         raise UsageError(shards.folder, fault, "give other shards")
+    recordings = shards.recordings(row["episode_index"] for row in rows)
+    first = np.unique(recordings, return_index=True)[1]
+    others = np.setdiff1d(np.arange(len(rows)), first)
+    rows = [rows[number] for number in (*np.sort(first), *others)]
     seen = SeenShards(shards, cameras_for(world.model, shards))
     at = np.arange(count) * shards.row_stride
     kept = [seen.window(row, at) for row in rows[: len(scenes.numbers)]]
@@ -205,7 +211,7 @@ def recorded_beginnings(world: World, scenes: Scenes, shards: ShardSet) -> tuple
     # the action in force at the last frame of the prompt; without one, a target is zero
     last = [prompt.chunks[-1, -dims:] if len(prompt.chunks) else np.zeros(dims) for prompt in prompts]
     held = at_rest(scenes.dimensions, np.nan_to_num(np.stack(last)))
-    return Beginning(scenes, prompts, held), len(kept)
+    return Beginning(scenes, prompts, held), min(len(first), len(kept))
 
 
 def _try(name: str, policy: Policy, world: World, begun: Beginning) -> None:
@@ -243,8 +249,8 @@ def html(found: ModelEvaluation) -> str:
     """Return the page."""
     lead = (
         f"{found.embodiment} in {found.checkpoint} ({found.sampling}): {found.policies[0].success.size} "
-        f"episodes of {found.frames} frames per policy, from the first frames of {found.beginnings} held-out "
-        "recorded episodes"
+        f"episodes of {found.frames} frames per policy, from the first frames of held-out episodes of "
+        f"{human_count(found.beginnings, 'recording')}"
     )
     page = Page("Policies inside the world model", lead)
     page.table(COLUMNS, found.table())

@@ -25,7 +25,7 @@ from hma_data.errors import HMAError, MissingDependencyError, UsageError
 from hma_data.lab import imported
 from hma_data.shards.reader import ShardSet
 from hma_model.arrays import Bools, Floats, Images
-from hma_model.evaluation.agreement import Accuracy, accuracy, share_interval
+from hma_model.evaluation.agreement import Accuracy, accuracy, by_scene, independent, share_interval
 from hma_model.evaluation.state_reader import Tell
 from hma_model.generation.decode import cameras_for
 from hma_model.policies.lerobot import CONFIG, TASK, hub_repository, network_images
@@ -157,6 +157,7 @@ class RewardJudge:
     Attributes:
         held_out: its accuracy on recorded episodes that are held out of training.
         hits, alarms: successes, and failures, that it calls a success.
+        hits_95, alarms_95: intervals of their shares, over recordings.
     """
 
     source: str
@@ -164,31 +165,31 @@ class RewardJudge:
     held_out: Accuracy
     hits: int
     alarms: int
+    hits_95: tuple[float, float]
+    alarms_95: tuple[float, float]
 
     @property
     def sentence(self) -> str:
         """Return in words how often it is right."""
         found = self.held_out
-        seen = _of(self.hits, found.successes)
-        false = _of(self.alarms, found.count - found.successes)
+        seen = _of(self.hits, found.successes, self.hits_95)
+        false = _of(self.alarms, found.count - found.successes, self.alarms_95)
         return f"judge on held-out recorded episodes: true positives {seen}, false positives {false}"
 
     def to_json(self) -> dict[str, Any]:
         """Return its figures as plain values."""
-        failures = self.held_out.count - self.held_out.successes
         return {
             "model": self.source,
             "held_out": vars(self.held_out),
             "true_positives": self.hits,
-            "true_positive_interval": share_interval(self.hits, self.held_out.successes),
+            "true_positive_interval": self.hits_95,
             "false_positives": self.alarms,
-            "false_positive_interval": share_interval(self.alarms, failures),
+            "false_positive_interval": self.alarms_95,
         }
 
 
-def _of(part: int, whole: int) -> str:
-    low, high = share_interval(part, whole)
-    return f"{part} of {whole} ({low:.0%} to {high:.0%})"
+def _of(part: int, whole: int, ends: tuple[float, float]) -> str:
+    return f"{part} of {whole} ({ends[0]:.0%} to {ends[1]:.0%})"
 
 
 def measured_judge(
@@ -215,13 +216,14 @@ def measured_judge(
     rows = [row for row in rows if row["success"] is not None]
     true = np.array([row["success"] for row in rows], np.bool_)
     where = f"judge {source}"
-    if not len(rows) or accuracy(true, true).too_few:
+    recordings = shards.recordings(row["episode_index"] for row in rows)
+    if not len(rows) or accuracy(*by_scene(recordings, true, true)).too_few:
         successes = int(true.sum())
         fault = (
             f"{shards.folder} has {successes} successes and {len(true) - successes} failures among its "
             "held-out episodes with a success label, too few to measure its accuracy"
         )
-        remedy = f"give {SHARDS} with {NEEDED} or more of each"
+        remedy = f"give {SHARDS} with {NEEDED} or more of each, of different recordings"
         raise HMAError(where, fault, remedy)
     seen = SeenShards(shards, cameras_for(world.model, shards))
     model = RewardModel(source, seen.cameras, embodiment, str(world.model.device))
@@ -231,10 +233,12 @@ def measured_judge(
         images = world.shown(frames[:: shards.row_stride])
         judged[place] = model.success(model.score(images[None]))[0]
         tell(f"measuring the judge: episode {place + 1} of {len(rows)}")
-    found = accuracy(true, judged)
-    judge = RewardJudge(source, model, found, int(judged[true].sum()), int(judged[~true].sum()))
+    success, said, kept = by_scene(recordings, true, judged)
+    found = accuracy(success, said, kept)
+    ends = [share_interval(*independent(said, one)) for one in (success, ~success & kept)]
+    judge = RewardJudge(source, model, found, int(judged[true].sum()), int(judged[~true].sum()), *ends)
     if not found.better_than_chance:
-        fault = f"is no better than chance: {judge.sentence.partition(': ')[2]}"
+        fault = f"may be no better than chance: {judge.sentence.partition(': ')[2]}"
         raise HMAError(where, fault, "train it on more episodes, or give another one")
     return judge
 

@@ -26,7 +26,7 @@ from hma_data.shards.windows import episode_pieces
 from hma_data.sources.common.video_file import VideoFile, frame_table
 from hma_data.storage.files import file_sha256
 from hma_data.storage.paths import StrPath, as_path
-from hma_model.arrays import Bools, Float32s
+from hma_model.arrays import Bools, Float32s, Ints
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.generation.commands import described
 from hma_model.generation.decode import trained_cameras
@@ -147,6 +147,10 @@ class ShardFilm:
     def numbers(self, split: str) -> list[int]:
         """Return the numbers of the episodes of a split."""
         return [number for number, (row, _) in enumerate(self._parts) if row["split"] == split]
+
+    def recordings(self, numbers: Sequence[int]) -> Ints:
+        """Return the recording of each of some episodes."""
+        return self._seen.shards.recordings(self._parts[number][0]["episode_index"] for number in numbers)
 
     def stored(self, number: int) -> NDArray[Any]:
         """Return the frames (T, …) of an episode."""

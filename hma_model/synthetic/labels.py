@@ -10,6 +10,7 @@ T frames, A action dims, K = stride · A.
 """
 
 import hashlib
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -26,9 +27,10 @@ from hma_data.shards.schema import Refused
 from hma_data.storage.kept import KeptParts, remove_kept
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
-from hma_model.arrays import Float32s
+from hma_model.arrays import Float32s, Floats
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.config import INVERSE
+from hma_model.evaluation.intervals import ends_of, interval
 from hma_model.generation.commands import Commands, yaml_of
 from hma_model.generation.decode import trained_cameras
 from hma_model.network.model import HMA
@@ -55,6 +57,7 @@ class LabelError:
         names: A names with units.
         rmse: (A,) in these units.
         spread: (A,) standard deviation of the true actions: the error of always giving their mean.
+        explained_95: (A,) intervals of `explained` over recordings; None of one recording.
         commands: how many were compared.
     """
 
@@ -63,6 +66,7 @@ class LabelError:
     names: tuple[str, ...]
     rmse: tuple[float, ...]
     spread: tuple[float, ...]
+    explained_95: tuple[list[float] | None, ...]
     commands: int
 
     @property
@@ -188,7 +192,8 @@ def measure(
     numbers = film.numbers(split)[:MAX_CHECKED]
     width = len(spec.names)
     pairs = list[Float32s]()  # (2, n, A): errors, and true values
-    for done, number in enumerate(numbers):
+    recordings = list[int]()
+    for done, (number, recording) in enumerate(zip(numbers, film.recordings(numbers))):
         on_progress(done, "checking on labelled video", len(numbers))
         stored, actions, known = film.labelled(number)
         if len(stored) < 2:
@@ -197,6 +202,7 @@ def measure(
         chunks = actions[:-1]
         both = np.stack([infer(world.model, spec, stored) - chunks, chunks])
         pairs.append(both[:, known[:-1]].reshape(2, -1, width))
+        recordings += [recording] * pairs[-1].shape[1]
     if not any(both.size for both in pairs):
         raise HMAError(shards.folder, "has no known actions to compare with", "name labelled shards")
     misses, values = np.concatenate(pairs, axis=1).astype(np.float64)
@@ -205,11 +211,29 @@ def measure(
     units = [part.unit or "" for part in robot.action.components for _ in range(part.dims)]
     names = tuple(f"{name} {unit}".strip() for name, unit in zip(spec.names, units, strict=True))
     spread = tuple(values.std(axis=0).tolist())
-    found = LabelError(shards.folder.name, split, names, tuple(rmse.tolist()), spread, len(values))
+    ends = explained_95(misses, values, recordings)
+    found = LabelError(shards.folder.name, split, names, tuple(rmse.tolist()), spread, ends, len(values))
     if not any(share is not None and share > 0 for share in found.explained):
         fault = "inferred actions are no better than their mean on labelled video"
         raise HMAError(spec.embodiment, fault, "train the inverse model longer, or on more data")
     return found
+
+
+def explained_95(misses: Floats, values: Floats, own: Sequence[int]) -> tuple[list[float] | None, ...]:
+    """Return the intervals (A,) of the share of variance explained, from errors and true values (n, A).
+
+    `own` (n,) are the recordings. The share is a ratio; to first order it varies as the mean of what each
+    recording adds to it.
+    """
+    spread = values.var(axis=0)
+    spread[spread == 0] = np.nan
+    share = 1 - np.square(misses).mean(axis=0) / spread
+    added = (np.square(misses) - (1 - share) * np.square(values - values.mean(axis=0))) / spread
+    names, place = np.unique(own, return_inverse=True)
+    sums = np.zeros((len(names), len(share)))
+    np.add.at(sums, place, added)
+    ends = interval(share - sums * (len(names) / len(values)), within=(-math.inf, 1.0))
+    return tuple(map(ends_of, ends.T))
 
 
 def _check_set(model: HMA, embodiment: str, check: StrPath | None) -> ShardSet:

@@ -1,6 +1,8 @@
 """Small shard sets for the tests of this folder: a mark that moves over the grid as its actions say."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -29,15 +31,19 @@ def episode(
     return tokens.reshape(length, *grid), actions.astype(np.float32)
 
 
-def state_pauses(folder: Path, *pauses: dict[int, int]) -> None:
-    """Let episodes.parquet state pauses of the first episodes: recorded frame -> steps to the next one."""
+def state(folder: Path, column: str, first: Sequence[Any] = (), last: Sequence[Any] = ()) -> None:
+    """Let episodes.parquet state other values of a column for the first or the last episodes."""
     path = folder / "episodes.parquet"
     table = pq.read_table(path)
-    flags = [flags_text(0, {}, one) for one in pauses] + [""] * (len(table) - len(pauses))
-    at = table.schema.get_field_index("flags")
-    pq.write_table(
-        table.set_column(at, table.schema.field(at), pa.array(flags, table.schema.types[at])), path
-    )
+    at, kept = table.schema.get_field_index(column), table[column].to_pylist()
+    values = [*first, *kept[len(first) : len(kept) - len(last)], *last]
+    field = table.schema.field(at)
+    pq.write_table(table.set_column(at, field, pa.array(values, field.type)), path)
+
+
+def state_pauses(folder: Path, *pauses: dict[int, int]) -> None:
+    """Let episodes.parquet state pauses of the first episodes: recorded frame -> steps to the next one."""
+    state(folder, "flags", [flags_text(0, {}, one) for one in pauses])
 
 
 def make_shards(

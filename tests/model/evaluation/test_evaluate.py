@@ -31,7 +31,7 @@ from hma_model.evaluation.tables import FIGURES, means
 from hma_model.evaluation.verdict import follows, verdict
 from hma_model.network.model import HMA
 from tests.model.robots import CONFIG, SPEC, Blocks, make_model
-from tests.model.shards import make_shards
+from tests.model.shards import make_shards, state
 
 
 def evaluate(model: HMA, tokenizer: Any, data: Any, **settings: Any) -> dict[str, Any]:
@@ -313,12 +313,14 @@ def test_the_verdict_says_whether_the_model_follows_its_actions() -> None:
     assert follows(GAIN) and verdict(GAIN) == f"follows its actions: {said}"
     assert not follows(NO_GAIN)
     assert verdict(NO_GAIN).startswith("does not follow its actions yet: last-frame PSNR gain +0.1 dB")
-    heard = NO_GAIN | {"loss": 2.0, "shuffled_loss": 4.0}
+    heard = NO_GAIN | {"loss": 2.0, "shuffled_loss": 4.0, "loss_action_gain_95": [1.0, 3.0]}
     assert verdict(heard).startswith(
         "is sensitive to its actions (loss 2.00 nats per token, 4.00 with shuffled actions), but"
     )
     assert "(loss 2.00 nats per square of 2×2 tokens, 4.00" in verdict(heard | {"merge": 2})
     assert verdict(heard | {"shuffled_loss": 2.1}).startswith("does not follow its actions yet")
+    for ends in (None, [-0.1, 4.1]):
+        assert verdict(heard | {"loss_action_gain_95": ends}).startswith("does not follow its actions yet")
 
 
 def test_the_verdict_states_its_horizon_and_says_when_the_episodes_are_few() -> None:
@@ -326,6 +328,7 @@ def test_the_verdict_states_its_horizon_and_says_when_the_episodes_are_few() -> 
     assert "recorded vs shuffled actions, 0.6 s after the prompt, 8 held-out" in verdict(timed)
     assert verdict(GAIN | {"episodes": 4}).endswith(", only 4 held-out episodes")
     assert verdict(GAIN | {"split": "train"}).endswith("actions, 8 episodes")
+    assert verdict(GAIN | {"recordings": 2}).endswith(", only 8 held-out episodes of 2 recordings")
 
 
 def test_no_model_follows_without_an_interval_above_zero() -> None:
@@ -347,8 +350,19 @@ def test_a_single_episode_has_no_interval(data, model):
     found = evaluate(model, Blocks(), data, windows=5, prompt=1)
     assert found["episodes"] == 1 and found["windows"] == 5
     assert found["true"]["psnr_95"] is None and found["loss_95"] is None and found["perplexity_95"] is None
-    assert any("all windows come from one episode, so no figure has an interval" in t for t in found["notes"])
+    assert any(
+        "all windows come from one recording, so no figure has an interval" in t for t in found["notes"]
+    )
     assert found["true"]["psnr_by_frame_95"][0] == [None, None]
+
+
+def test_episodes_of_one_recording_have_no_interval(model, tmp_path):
+    data = make_shards(tmp_path, "arm", held_out=3)
+    found = evaluate(model, Blocks(), data, windows=6, prompt=1)
+    assert found["recordings"] == 3 and found["loss_95"] and found["loss_action_gain_95"]
+    state(data, "group", last=["one"] * 3)
+    found = evaluate(model, Blocks(), data, windows=6, prompt=1)
+    assert (found["episodes"], found["recordings"], found["loss_95"]) == (3, 1, None)
 
 
 def test_episodes_are_resampled_whole():
@@ -387,7 +401,7 @@ def test_no_interval_of_two_episodes_leaves_what_a_figure_can_be(tmp_path, model
         assert low.min() >= 0 and high.max() <= 60
         assert found[kind]["ssim_95"][0] >= -1 and found[kind]["ssim_95"][1] <= 1
     part = Part(
-        "one", "two", found, {"true.psnr": np.array([1.0, 59.0]), "episode": np.array([0.0, 1.0])}, {}
+        "one", "two", found, {"true.psnr": np.array([1.0, 59.0]), "recording": np.array([0.0, 1.0])}, {}
     )
     figures = [figure for figure in FIGURES if figure.path == "true.psnr"]
     with pytest.MonkeyPatch.context() as patch:

@@ -89,7 +89,7 @@ def test_every_checkpoint_is_evaluated_on_every_set_and_the_mean_counts_sets_onc
 
 def test_a_loss_too_large_for_a_perplexity_is_no_error() -> None:
     found = {"embodiment": "arm", "windows": 2, "episodes": 2, "perplexity": 1e300}
-    parts = [Part("run", "set", found, {"loss": np.array([700.0, 820.0]), "episode": np.arange(2)}, {})]
+    parts = [Part("run", "set", found, {"loss": np.array([700.0, 820.0]), "recording": np.arange(2)}, {})]
     assert means(parts)[0]["perplexity"] == np.inf
 
 

@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 import torch
 from lerobot.configs.rewards import RewardModelConfig
@@ -24,12 +22,13 @@ from hma_model.checkpoint.folder import Checkpoint
 from hma_model.cli import app
 from hma_model.evaluation.agreement import accuracy
 from hma_model.lerobot_env.vector import LeRobotVectorEnv
-from hma_model.policies.recorded import UNKNOWN, evaluate_recorded, html
+from hma_model.policies.arenas import Scenes
+from hma_model.policies.recorded import UNKNOWN, evaluate_recorded, html, recorded_beginnings
 from hma_model.policies.report import write_report
 from hma_model.policies.rewards import NEEDED, RewardModel, measured_judge
 from hma_model.simulate import World, load_world
 from hma_model.synthetic.augment import Augmentation, augment
-from tests.model.shards import make_shards
+from tests.model.shards import make_shards, state
 from tests.model.true_world import trained_on
 
 pytestmark = pytest.mark.slow  # of the import of lerobot, and of transformers, which the encoder needs
@@ -66,11 +65,7 @@ def saved(folder: Path, limit: float, *cameras: str) -> Path:
 
 def label(shards: Path, outcomes: list[bool | None]) -> None:
     """Let episodes.parquet state the outcomes of the last episodes."""
-    path = shards / "episodes.parquet"
-    table = pq.read_table(path)
-    values = [None] * (len(table) - len(outcomes)) + outcomes
-    at = table.schema.get_field_index("success")
-    pq.write_table(table.set_column(at, table.schema.field(at), pa.array(values, pa.bool_())), path)
+    state(shards, "success", last=outcomes)
 
 
 @pytest.fixture
@@ -112,6 +107,18 @@ def test_its_true_and_false_positives_are_those_of_the_held_out_episodes(world, 
     assert found.sentence == f"judge on held-out recorded episodes: {said}"
     assert told[-1] == "measuring the judge: episode 16 of 16"
     assert found.to_json()["false_positive_interval"] == pytest.approx((0.003, 0.527), abs=1e-3)
+
+
+def test_held_out_episodes_of_one_recording_count_as_one(world, shards, judge) -> None:
+    state(shards, "group", last=[f"r{number // 4}" for number in range(HELD_OUT)])
+    with pytest.raises(HMAError, match=f"with {NEEDED} or more of each, of different recordings"):
+        measured_judge(str(judge), world, ROBOT, ShardSet(shards))
+    state(shards, "group", last=[f"r{number // 2 % 6}" for number in range(HELD_OUT)])
+    found = measured_judge(str(judge), world, ROBOT, ShardSet(shards))
+    assert (found.hits, found.alarms, found.held_out.count) == (7, 1, 16)
+    assert found.hits_95[0] < 0.45 and found.alarms_95[1] > 0.55  # of eight recordings 0.47 and 0.53
+    scenes = Scenes.of(world, ROBOT, 12, 0, simulator=False)
+    assert recorded_beginnings(world, scenes, ShardSet(shards))[1] == 6
 
 
 def test_policies_are_scored_in_the_model_alone_and_a_stop_continues(
@@ -180,7 +187,7 @@ def test_policies_that_need_a_simulator_are_refused(world, shards, judge, policy
 def test_a_judge_no_better_than_chance_and_too_few_labels_are_refused(world, shards, judge) -> None:
     label(shards, [bool(number % 2) for number in range(HELD_OUT)])
     always = saved(judge.parent / "always", -1.0)
-    said = r"is no better than chance: true positives 8 of 8 \(63% to 100%\), false positives 8 of 8 \(63"
+    said = r"may be no better than chance: true positives 8 of 8 \(63% to 100%\), false positives 8 of 8 \(63"
     with pytest.raises(HMAError, match=said):
         measured_judge(str(always), world, ROBOT, ShardSet(shards))
     label(shards, [True, True, False] + [None] * (HELD_OUT - 3))

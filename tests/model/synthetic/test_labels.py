@@ -23,7 +23,7 @@ from hma_model.simulate import World, read_prompt
 from hma_model.synthetic import film as film_module
 from hma_model.synthetic import labels
 from hma_model.synthetic.film import ShardFilm, _seen_by, read_film
-from hma_model.synthetic.labels import infer, label_actions
+from hma_model.synthetic.labels import explained_95, infer, label_actions
 from tests.conftest import BlockTokenizer
 from tests.data import cameras
 from tests.model.shards import state_pauses
@@ -109,6 +109,16 @@ def test_inference_reads_each_chunk_off_a_window_around_it(world: World) -> None
     assert len(made) == 10
 
 
+def test_the_variance_explained_has_an_interval_over_recordings() -> None:
+    rng = np.random.default_rng(0)
+    level, values = np.repeat(rng.uniform(0.1, 0.9, 20), 10)[:, None], rng.normal(size=(200, 1))
+    misses = level * rng.normal(size=(200, 1))
+    ((low, high),), (apart,) = (explained_95(misses, values, np.arange(200) // n) for n in (10, 1))
+    share = 1 - np.square(misses).mean() / values.var()
+    assert low < share < high and high - low > 1.2 * (apart[1] - apart[0])
+    assert explained_95(misses, values, np.zeros(200)) == (None,)
+
+
 @pytest.mark.slow
 def test_labels_no_better_than_the_mean_are_refused(world: World, real: Path, tmp_path: Path) -> None:
     with pytest.raises(HMAError, match="are no better than their mean on labelled video"):
@@ -170,7 +180,7 @@ def test_film_that_cannot_be_read_goes_to_quarantine(world, real, tmp_path, monk
     (places / "none.mp4").write_bytes(b"")
     write_mp4(places / "one.mp4", [np.zeros((96, 128, 3), np.uint8)], 10)
     monkeypatch.setattr(
-        labels, "measure", lambda *_: labels.LabelError("s", "val", ("a",), (0.1,), (1.0,), 9)
+        labels, "measure", lambda *_: labels.LabelError("s", "val", ("a",), (0.1,), (1.0,), (None,), 9)
     )
     found = label_actions(places, tmp_path / "out", ROBOT, checkpoint="", check=real, world=world)
     assert found.manifest.quarantined == 3 and verify(tmp_path / "out") == []
@@ -197,7 +207,7 @@ def shown(world: World, out: Path) -> dict[str, int]:
 def test_film_that_has_grown_or_changed_is_never_taken_for_what_was_labelled(
     world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    known = labels.LabelError("s", "val", ("a",), (0.1,), (1.0,), 9)
+    known = labels.LabelError("s", "val", ("a",), (0.1,), (1.0,), (None,), 9)
     monkeypatch.setattr(labels, "measure", lambda *_: known)
     monkeypatch.setattr(labels, "_check_set", lambda *_: None)
     labelled = list[int]()
@@ -277,7 +287,7 @@ def test_labelled_shards_name_the_cameras_that_their_images_are_of(
     three: ShardSet, views: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(labels, "yaml_of", generation_commands.yaml_of)
-    known = labels.LabelError("s", "val", ("a",), (0.1,), (1.0,), 9)
+    known = labels.LabelError("s", "val", ("a",), (0.1,), (1.0,), (None,), 9)
     monkeypatch.setattr(labels, "measure", lambda *_: known)
     world: Any = World(trained_on(views, three, tmp_path / "model", "inverse").model, BlockTokenizer())
     given: Any = {"checkpoint": "", "check": three.folder, "world": world}
