@@ -121,32 +121,21 @@ def from_inspection(found: Inspection, embodiment_id: str) -> str:
     return head + (f"# {known}\n" if known else "") + _yaml_text(values)
 
 
-def action_offsets(found: Inspection) -> dict[str, Offset]:
-    """Return by topic how actions lie between the images of the camera that `infer` takes as the clock."""
+def proposal(found: Inspection) -> tuple[str, dict[str, float], dict[str, Offset]]:
+    """Return what a recording lacks for `infer`, and what is known of the action that `infer` takes.
+
+    Returns:
+        "has no colour camera" and the like, empty where nothing lacks; by topic how many seconds the action
+        ends before the first frame; by topic how it lies between the images of the camera that is the clock.
+    """
+    if found.format == "hands":  # videos need no action
+        return "", {}, {}
     try:
-        return _Draft(found).offsets
-    except SourceError:
-        return {}
-
-
-def held_actions(found: Inspection) -> dict[str, float]:
-    """Return the topics of the action that end before the first frame, and by how many seconds."""
-    try:
-        topics = infer_topics.about(_Draft(found).action.keys)
-    except SourceError:
-        return {}
-    return {topic.name: topic.held_s for topic in topics if topic.held_s is not None}
-
-
-def lacking(found: Inspection) -> str:
-    """Return what a recording lacks for `infer`, as "has no colour camera"; empty where it lacks nothing."""
-    if found.format == "hands":
-        return ""
-    try:
-        _Draft(found)
+        draft = _Draft(found)
     except SourceError as fault:
-        return fault.fault.partition(";")[0]
-    return ""
+        return fault.fault.partition(";")[0], {}, {}
+    topics = infer_topics.about(draft.action.keys)
+    return "", {one.name: one.held_s for one in topics if one.held_s is not None}, draft.offsets
 
 
 def _in_registry(found: Inspection, values: dict[str, Any]) -> str:

@@ -28,7 +28,7 @@ from hma_data.episodes.images import describe_resize
 from hma_data.episodes.movement import framing
 from hma_data.episodes.offset import Offset, measure
 from hma_data.errors import EpisodeError, HMAError, SourceError
-from hma_data.inspection.infer import action_offsets, held_actions, lacking
+from hma_data.inspection.infer import proposal
 from hma_data.registry.components import Sync
 from hma_data.registry.embodiment import ONE_INDEX, Embodiment, find
 from hma_data.sources.base import SAMPLE, Inspection, LaidOut, Source, open_source
@@ -106,9 +106,9 @@ def inspect_recording(
     elif robot:
         report["embodiment"] = _fit(uri, robot, source, inspection, found)
     else:
-        offsets = action_offsets(inspection)
+        offsets = proposal(inspection)[2]
         report["facts"] |= {f"actions {name}": offset.measured for name, offset in offsets.items()}
-        found += [*unanswered(inspection), *proposed(offsets)]
+        found += unanswered(inspection)
     report["findings"] = [finding.to_json() for finding in found]
     report["problems"] = [str(finding) for finding in found if finding.severity != "info"]
     report["checks"] = _results(inspection.checks, found)
@@ -191,30 +191,28 @@ def _constant(deviations: NDArray[Any], robot: Embodiment) -> list[str]:
 
 def unanswered(inspection: Inspection) -> Iterator[Finding]:
     """Yield what the YAML of a robot needs and the recording does not have."""
-    if lack := lacking(inspection):
+    lack, held, offsets = proposal(inspection)
+    if lack:
         said = f"the recording {lack}"
         yield Finding(
             "robot", "warn", said, "record cameras and the robot's actions or joint states together"
         )
-    for topic, seconds in held_actions(inspection).items():
+    for topic, seconds in held.items():
         said = f"{topic}: its last message is {seconds:.3g} s before the first frame, held throughout"
         yield Finding("offset", "warn", said, "do not train on constant actions: use another key", topic)
     if inspection.format in ONE_INDEX and not inspection.hz:
         yield Finding(
             "rate", "info", "the recording states no rate", "state frequency_hz in the robot's YAML"
         )
-
-
-# -- actions beside frames
-
-
-def proposed(offsets: dict[str, Offset]) -> Iterator[Finding]:
-    """Yield a finding for actions that plain `hold` would pair with the frame after theirs."""
+    # plain `hold` would pair these actions with the frame after theirs
     for name, offset in offsets.items():
         if offset.tolerance_ms and offset.after_ms:
             numbers = {"after_ms": offset.after_ms[0], "tolerance_ms": offset.tolerance_ms}
             said = f"{name} vs {offset.camera}: {offset.said}"
             yield Finding("offset", "info", said, f"set sync: {{{offset.pairing}}}", name, numbers)
+
+
+# -- actions beside frames
 
 
 def judged(clips: list[Clip], robot: Embodiment) -> dict[str, tuple[Offset, Finding | None]]:
@@ -305,7 +303,6 @@ def _recording(uri: str, robot: Embodiment | None, sample: int) -> Iterator[Find
     elif robot is None:
         yield from _without_robot(inspection)
         yield from unanswered(inspection)
-        yield from proposed(action_offsets(inspection))
     else:
         yield from _for_robot(inspection, robot)
         yield from _episodes(uri, robot, source, sample, inspection)
