@@ -20,11 +20,12 @@ from hma_data.sources.bags.container import (
     ALL,
     MAX_CHUNK,
     Channel,
-    ChunkCache,
+    Chunks,
     Data,
     Record,
     RecordFilter,
     damaged,
+    kept_chunks,
     reading,
     unzstd,
 )
@@ -83,7 +84,7 @@ class Bag:
         Packed files (.zstd) are unpacked to a temporary folder, and remote sqlite3 files are copied there.
         """
         if self._files is None:
-            chunks = ChunkCache()
+            chunks = kept_chunks()
             self._files = [_container(self._plain(path), chunks) for path in self._paths]
         return self._files
 
@@ -235,7 +236,7 @@ def is_bag_folder(path: Path) -> bool:
     return b"rosbag2_bagfile_information" in first_bytes(path / "metadata.yaml", 4096)
 
 
-def _container(path: Path, chunks: ChunkCache) -> Container:
+def _container(path: Path, chunks: Chunks) -> Container:
     magic = first_bytes(path, 16)
     if magic.startswith(b"#ROSBAG"):
         return Ros1File(path, chunks)

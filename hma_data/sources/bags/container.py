@@ -192,9 +192,8 @@ class IndexedFile(ABC):
     Every method of a container raises EpisodeError when the file is damaged.
     """
 
-    def __init__(self, path: Path, chunks: "ChunkCache | None" = None) -> None:
-        self.path = path
-        self._chunks = chunks or ChunkCache()
+    def __init__(self, path: Path, chunks: "Chunks") -> None:
+        self.path, self._chunks = path, chunks
         self._file = LargeFile(path)
         self._indexed: FileIndex | None = None
 
@@ -314,24 +313,30 @@ def take_last(found: dict[str, Record], records: Iterable[Record]) -> None:
             found[topic] = record._replace(data=bytes(record.data))
 
 
-class ChunkCache:
-    """The last unpacked chunks of one bag: at most CACHED_BYTES of them, and always at least one."""
+class Recent[K, V]:
+    """The values used last, as many as `most` allows of their sizes, and always at least one."""
 
-    def __init__(self) -> None:
-        self._chunks: OrderedDict[tuple[Path, int], bytes] = OrderedDict()
-        self._bytes = 0
+    def __init__(self, most: int, size: Callable[[V], int] = lambda value: 1) -> None:
+        self._values: OrderedDict[K, V] = OrderedDict()
+        self._room, self._size = most, size
 
-    def get(self, path: Path, offset: int, load: Callable[[], bytes]) -> memoryview:
-        """Return the chunk at an offset of a file; `load` unpacks it where it is not cached."""
-        key = (path, offset)
-        if key in self._chunks:
-            self._chunks.move_to_end(key)
-            return memoryview(self._chunks[key])
-        chunk = self._chunks[key] = load()
-        self._bytes += len(chunk)
-        while self._bytes > CACHED_BYTES and len(self._chunks) > 1:
-            self._bytes -= len(self._chunks.popitem(last=False)[1])
-        return memoryview(chunk)
+    def get(self, key: K, make: Callable[[], V]) -> V:
+        """Return the value of a key; it is made where it is not kept."""
+        if key not in self._values:
+            self._values[key] = made = make()
+            self._room -= self._size(made)
+        self._values.move_to_end(key)
+        while self._room < 0 and len(self._values) > 1:
+            self._room += self._size(self._values.popitem(last=False)[1])
+        return self._values[key]
+
+
+Chunks = Recent[tuple[Path, int], bytes]  # unpacked chunks, by their offsets in the files of a bag
+
+
+def kept_chunks() -> Chunks:
+    """Return what keeps the chunks of one bag that were unpacked last."""
+    return Recent(CACHED_BYTES, len)
 
 
 def decompress(codec: str, data: bytes, size: int) -> bytes:

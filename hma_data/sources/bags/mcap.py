@@ -23,7 +23,7 @@ from mcap.data_stream import ReadDataStream
 
 from hma_data.sources.bags.container import (
     Channel,
-    ChunkCache,
+    Chunks,
     FileIndex,
     FileView,
     IndexedFile,
@@ -49,7 +49,7 @@ RUN_BYTES = 1 << 20  # most bytes of messages outside of chunks that make one pi
 class McapFile(IndexedFile):
     """An MCAP file."""
 
-    def __init__(self, path: Path, chunks: ChunkCache | None = None) -> None:
+    def __init__(self, path: Path, chunks: Chunks) -> None:
         super().__init__(path, chunks)
         self._schemas: dict[int, Any] = {}
 
@@ -64,7 +64,7 @@ class McapFile(IndexedFile):
         opcode, start, stop = _record(whole, at)
         if opcode != CHUNK:
             return FileView(file, at, end or len(whole))
-        return self._chunks.get(self.path, at, lambda: _unpacked(whole[start:stop]))
+        return memoryview(self._chunks.get((self.path, at), lambda: _unpacked(whole[start:stop])))
 
     def _messages(self, index: FileIndex, view: View, at: int = 0) -> Iterator[StoredMessage]:
         """See IndexedFile."""

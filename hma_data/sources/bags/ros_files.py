@@ -59,7 +59,7 @@ class Ros1File(IndexedFile):
             data = FileView(file, start, end)[0 : end - start]
             return decompress(header["compression"].decode(), data, _number(header, "size"))
 
-        return self._chunks.get(self.path, at, unpacked)
+        return memoryview(self._chunks.get((self.path, at), unpacked))
 
     def _messages(self, index: FileIndex, view: View, at: int = 0) -> Iterator[StoredMessage]:
         """See IndexedFile."""

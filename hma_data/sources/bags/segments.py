@@ -28,7 +28,7 @@ from hma_data.registry.components import Marker, Segments
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.bags.bag import Bag, BagPlace
 from hma_data.sources.bags.clocks import SECOND_NS, MessageTimes
-from hma_data.sources.bags.container import Record, RecordFilter
+from hma_data.sources.bags.container import Recent, Record, RecordFilter
 from hma_data.sources.bags.images import STILL_IMAGE, VIDEO, image_kind
 from hma_data.sources.bags.messages import decode
 from hma_data.sources.bags.topic_track import TopicTrack, missing_topic, parse_key
@@ -88,8 +88,8 @@ class SegmentTable:
 
 
 # By process id: a forked child must not clean up after its parent.
-_bags: dict[int, dict[Any, Bag]] = {}
-_tables: dict[Any, SegmentTable] = {}
+_bags: dict[int, Recent[Any, Bag]] = {}
+_tables = Recent[Any, SegmentTable](KEPT_TABLES)
 
 
 def parted(opened: Bag, root: Path, embodiment: Embodiment, segments: Segments) -> tuple[Bag, SegmentTable]:
@@ -99,10 +99,10 @@ def parted(opened: Bag, root: Path, embodiment: Embodiment, segments: Segments) 
         EpisodeError: the bag cannot be read, or holds no episode.
     """
     path, state = opened.path, opened.state()
-    bag = _cached(_bags.setdefault(os.getpid(), {}), (path, root, state), lambda: opened, KEPT_BAGS)
+    bag = _bags.setdefault(os.getpid(), Recent(KEPT_BAGS)).get((path, root, state), lambda: opened)
     cameras = tuple((camera.key, camera.stamp) for camera in embodiment.cameras)
     key = (path, state, segments, cameras, embodiment.primary_camera.name, embodiment.sync.stamp)
-    table = _cached(_tables, key, lambda: _stored(key, lambda: part(bag, embodiment, segments)), KEPT_TABLES)
+    table = _tables.get(key, lambda: _stored(key, lambda: part(bag, embodiment, segments)))
     return bag, table
 
 
@@ -117,15 +117,6 @@ def _stored(key: Any, make: Callable[[], SegmentTable]) -> SegmentTable:
         kept.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(kept, json.dumps(asdict(table)))
     return table
-
-
-def _cached[V](cache: dict[Any, V], key: Any, make: Callable[[], V], limit: int) -> V:
-    """Return the value of a key, made where it is not cached; keep the last `limit` values."""
-    value = cache.pop(key) if key in cache else make()
-    cache[key] = value
-    while len(cache) > limit:
-        del cache[next(iter(cache))]
-    return value
 
 
 def part(bag: Bag, embodiment: Embodiment, segments: Segments) -> SegmentTable:
