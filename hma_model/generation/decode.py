@@ -60,6 +60,12 @@ def trained_cameras(model: Network, embodiment: str) -> Cameras:
     return kept.cameras(embodiment) if kept and embodiment in kept.embodiments else FIRST_CAMERA
 
 
+def trained_shards(model: Network, embodiment: str) -> ShardSet | None:
+    """Return the shards of an embodiment on which its model was trained; None if they are not here."""
+    there = model.source.shards() if model.source else []
+    return next((one for one in there if one.embodiment.id == embodiment), None)
+
+
 def cameras_for(model: Network, shards: ShardSet, cameras: Cameras | None = None) -> Cameras:
     """Return the cameras that a model sees: those given, or those that it was trained on.
 

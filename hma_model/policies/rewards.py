@@ -27,7 +27,7 @@ from hma_data.shards.reader import ShardSet
 from hma_model.arrays import Bools, Floats, Images
 from hma_model.evaluation.agreement import Accuracy, accuracy, by_scene, independent, share_interval
 from hma_model.evaluation.state_reader import Tell
-from hma_model.generation.decode import cameras_for
+from hma_model.generation.decode import cameras_for, trained_shards
 from hma_model.policies.lerobot import CONFIG, TASK, hub_repository, network_images
 from hma_model.worlds.env import Judge
 from hma_model.worlds.prompts import SeenShards, require_fit
@@ -251,10 +251,8 @@ def labelled_shards(world: World, embodiment: str, given: Any, judge: str) -> Sh
     """
     if given is not None:
         return ShardSet(given)
-    there = world.model.source.shards() if world.model.source else []
-    for shards in there:
-        if shards.embodiment.id == embodiment:
-            return shards
+    if (shards := trained_shards(world.model, embodiment)) is not None:
+        return shards
     fault = f"no recorded episodes of {embodiment} measure its accuracy"
     remedy = f"give {SHARDS} whose held-out episodes have {NEEDED} or more labelled successes and failures"
     raise UsageError(f"judge {judge}", fault, remedy)

@@ -32,7 +32,7 @@ from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.config import INVERSE
 from hma_model.evaluation.intervals import ends_of, interval
 from hma_model.generation.commands import Commands, yaml_of
-from hma_model.generation.decode import trained_cameras
+from hma_model.generation.decode import trained_cameras, trained_shards
 from hma_model.network.model import HMA
 from hma_model.policies.fingerprints import device_facts, world_digests
 from hma_model.synthetic.film import FilmEpisode, ShardFilm, find_film, read_film
@@ -238,18 +238,13 @@ def explained_95(misses: Floats, values: Floats, own: Sequence[int]) -> tuple[li
 
 def _check_set(model: HMA, embodiment: str, check: StrPath | None) -> ShardSet:
     """Return the labelled shards to check on: those given, else those that the model was trained on."""
-    if check is not None:
-        sets = [ShardSet(check)]
-    else:
-        sets = model.source.shards() if model.source else []
-    found = [one for one in sets if one.embodiment.id == embodiment]
-    if not found:
-        fault = "it has no labelled recordings here"
-        if check is not None:
-            fault = f"{check} is of {sets[0].embodiment.id}"
+    found = trained_shards(model, embodiment) if check is None else ShardSet(check)
+    if found is None or found.embodiment.id != embodiment:
+        other = "it has no labelled recordings here"
+        fault = other if found is None else f"{check} is of {found.embodiment.id}"
         raise UsageError(embodiment, fault, "name labelled shards of it that were held out: --check SHARDS")
-    require_tokenizer(model.config, found[0].spec, found[0].folder)
-    return found[0]
+    require_tokenizer(model.config, found.spec, found.folder)
+    return found
 
 
 def _label(

@@ -28,7 +28,7 @@ from hma_data.storage.paths import StrPath, as_path
 from hma_model.arrays import Bools, Float32s, Ints
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.generation.commands import described, yaml_of
-from hma_model.generation.decode import cameras_for, trained_cameras
+from hma_model.generation.decode import cameras_for, trained_cameras, trained_shards
 from hma_model.network.model import HMA
 from hma_model.worlds.images import Prompt, as_numbers, read_image, recorded_cameras, seen_cameras
 
@@ -145,12 +145,11 @@ def starting_window(model: HMA, embodiment: str, seed: int = 0) -> Prompt:
     if robot is not None and simulated(embodiment):
         with tempfile.TemporaryDirectory() as folder:
             return _of_recording(model, robot, record(embodiment, folder, 1, seed), EpisodePart())
-    for shards in model.source.shards() if model.source else ():
-        if shards.embodiment.id == embodiment:
-            fit = {row["id"]: row["split"] for row, _ in long_pieces(shards, default_frames(model))}
-            held = [name for name, split in fit.items() if split == "val"] or list(fit)
-            episode = held[seed % len(held)] if held else None  # the first one says the fault
-            return _of_shards(model, embodiment, shards.folder, EpisodePart(episode))
+    if (shards := trained_shards(model, embodiment)) is not None:
+        fit = {row["id"]: row["split"] for row, _ in long_pieces(shards, default_frames(model))}
+        held = [name for name, split in fit.items() if split == "val"] or list(fit)
+        episode = held[seed % len(held)] if held else None  # the first one says the fault
+        return _of_shards(model, embodiment, shards.folder, EpisodePart(episode))
     fault = "none is included: it has no simulator here, and the shards of its training are not here"
     raise HMAError(f"prompt of {embodiment}", fault, PROMPT_FORMS)
 
