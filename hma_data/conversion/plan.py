@@ -196,7 +196,10 @@ def choose_splits(refs: Sequence[EpisodeRef], val_fraction: float | None, seed: 
     if any(own.unique().to_pylist()):
         return [split or "train" for split in values_of(own)]
     groups = pc.if_else(pc.equal(group, ""), known.column("id"), group).combine_chunks().dictionary_encode()
-    draws = _unit_intervals(pc.binary_join_element_wise(str(seed), groups.dictionary, "/"))
+    texts = pc.binary_join_element_wise(str(seed), groups.dictionary, "/")
+    # the first eight bytes of each hash, big-endian, as a number in 0..1
+    hashed = b"".join(hashlib.sha256(text).digest() for text in values_of(texts.cast(pa.binary())))
+    draws = np.frombuffer(hashed, ">u8").reshape(-1, 4)[:, 0] / 2.0**64
     held = draws < (VAL_FRACTION if val_fraction is None else val_fraction)
     if len(draws) >= 2 and val_fraction != 0:
         least = 1 if val_fraction is not None else max(1, min(HELD_OUT, len(draws) // 4))
@@ -223,12 +226,6 @@ def pack(
         units.append(ShardUnit(name, split, pa.array(numbers[start:stop], pa.int64()), refs[start:stop]))
         start, filled = stop, int(ends[stop - 1])
     return units
-
-
-def _unit_intervals(texts: pa.Array) -> NDArray[np.float64]:
-    """Return a number in 0..1 for each text: the first eight bytes of its sha256, big-endian, over 2⁶⁴."""
-    hashed = b"".join(hashlib.sha256(text).digest() for text in values_of(texts.cast(pa.binary())))
-    return np.frombuffer(hashed, ">u8").reshape(-1, 4)[:, 0] / 2.0**64
 
 
 def differences(mine: dict[str, Any], theirs: dict[str, Any]) -> str:

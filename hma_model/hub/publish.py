@@ -87,7 +87,13 @@ def push(
     """
     source = Checkpoint.open(checkpoint, embodiments)
     ids = sorted(source.chosen(embodiments))
-    _require_publishable(source, ids)
+    weights.trunk(source)  # others must be able to load what is published
+    for name in ids:
+        checkpoints.read_embodiment(source, name)
+        stated = source.card(name).get("id", name)
+        if stated != name:
+            fault = f"is the card of {str(stated)[:60]!r}"
+            raise CheckpointError(source.path(name, CARD), fault, "save the checkpoint again")
     store = open_store(target, write=True, private=private)
     message = f"Add {', '.join(ids)}" if ids else "Add the trunk"
     return store.publish(lambda: _changes(source, ids, store, page), message)
@@ -132,17 +138,6 @@ def _is_same(own: weights.State, stored: weights.State) -> bool:
     return own.keys() == stored.keys() and all(
         bool((own[name].cpu() == stored[name].to(own[name].dtype)).all()) for name in own
     )
-
-
-def _require_publishable(source: Checkpoint, embodiments: Iterable[str]) -> None:
-    """Raise unless others can load the embodiments."""
-    weights.trunk(source)
-    for name in embodiments:
-        checkpoints.read_embodiment(source, name)
-        stated = source.card(name).get("id", name)
-        if stated != name:
-            fault = f"is the card of {str(stated)[:60]!r}"
-            raise CheckpointError(source.path(name, CARD), fault, "save the checkpoint again")
 
 
 def _changes(

@@ -267,9 +267,18 @@ class ParallelModel:
         return nullcontext()
 
     def average(self) -> None:
-        """Average, after the last pass, the gradients that neither DDP nor FSDP has averaged."""
-        if self._apart:
-            _average(self._apart, self.ranks)
+        """Average, after the last pass, the gradients that neither DDP nor FSDP has averaged.
+
+        A missing gradient counts as zero, unless no rank has it.
+        """
+        if not self._apart:
+            return
+        there = torch.tensor([float(p.grad is not None) for p in self._apart], device=self._apart[0].device)
+        used = [p for p, count in zip(self._apart, self.ranks.sum(there).tolist()) if count]
+        grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in used]
+        flat = self.ranks.sum(torch.cat([grad.flatten() for grad in grads])) / self.ranks.size
+        for p, grad, part in zip(used, grads, flat.split([p.numel() for p in used])):
+            p.grad = grad.copy_(part.view_as(p))
 
     def clip(self, limit: float) -> float:
         """Scale the gradients to at most this norm over all ranks, and return the norm they had."""
@@ -296,19 +305,6 @@ def _shard(model: HMA, ranks: Ranks) -> None:
     for block in model.trunk.blocks:
         fully_shard(block, mesh=mesh)
     fully_shard(model, mesh=mesh, ignored_params=kept)
-
-
-def _average(parameters: list[nn.Parameter], ranks: Ranks) -> None:
-    """Average gradients over ranks; a missing one counts as zero, unless no rank has it."""
-    there = torch.tensor([float(p.grad is not None) for p in parameters], device=parameters[0].device)
-    used = [p for p, count in zip(parameters, ranks.sum(there).tolist()) if count]
-    for p in used:
-        if p.grad is None:
-            p.grad = torch.zeros_like(p)
-    flat = ranks.sum(torch.cat([p.grad.flatten() for p in used if p.grad is not None])) / ranks.size
-    for p, part in zip(used, flat.split([p.numel() for p in used])):
-        assert p.grad is not None
-        p.grad.copy_(part.view_as(p))
 
 
 def local(tensor: Tensor) -> Tensor:

@@ -135,7 +135,10 @@ def picture(message: Any, kind: str, where: str, levels: Levels | None = None, l
             if levels is None:
                 remedy = "state the values of black and white in the YAML, such as levels: [0, 4095]"
                 raise EpisodeError(where, "images in mono16 have 16 bits of grey", remedy)
-            return _grey(wide_grey(message, kind, where), levels)
+            low, high = levels
+            values = wide_grey(message, kind, where).astype(np.float32)
+            scaled = (values - np.float32(low)) * np.float32(255 / (high - low))
+            return np.repeat(np.clip(np.rint(scaled), 0, 255).astype(np.uint8)[..., None], 3, axis=2)
         if kind == RAW:
             return _raw(message, where)
         if pattern := _mosaic(message):
@@ -187,13 +190,6 @@ def wide_grey(message: Any, kind: str, where: str) -> NDArray[np.uint16]:
     if found is None or found.ndim != 2:
         raise EpisodeError(where, "an image in mono16 cannot be decoded")
     return found.astype(np.uint16)
-
-
-def _grey(values: NDArray[np.uint16], levels: Levels) -> Images:
-    """Return (H, W, 3): values from the lower level to the upper one become 0 to 255, others are clipped."""
-    low, high = levels
-    scaled = (values.astype(np.float32) - np.float32(low)) * np.float32(255 / (high - low))
-    return np.repeat(np.clip(np.rint(scaled), 0, 255).astype(np.uint8)[..., None], 3, axis=2)
 
 
 def payload(message: Any) -> bytes:

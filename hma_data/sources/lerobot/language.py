@@ -34,23 +34,19 @@ def language_of(meta: Metadata, rows: Rows, times: Floats) -> list[dict[str, Any
         EpisodeError: its columns of language are not as lerobot writes them.
     """
     try:
-        return _items(meta, rows, times)
+        start = float(times[0])
+        found: list[dict[str, Any]] = []
+        if PERSISTENT in rows.columns:  # the same in every row
+            for item in rows.column(PERSISTENT)[0].as_py() or ():
+                found.append(dict(item) | {"column": "persistent", "timestamp": item["timestamp"] - start})
+        elif SUBTASK in rows.columns:
+            found += _subtasks(meta, rows, times - start)
+        if EVENTS in rows.columns:
+            for time, items in zip(times - start, rows.column(EVENTS).to_pylist(), strict=True):
+                found += [dict(item) | {"column": "events", "timestamp": float(time)} for item in items or ()]
+        return sorted(found, key=lambda item: float(item["timestamp"]))
     except (KeyError, TypeError, ValueError) as fault:
         raise EpisodeError(rows.path, f"its language is not as lerobot writes it: {fault!r}") from fault
-
-
-def _items(meta: Metadata, rows: Rows, times: Floats) -> list[dict[str, Any]]:
-    start = float(times[0])
-    found: list[dict[str, Any]] = []
-    if PERSISTENT in rows.columns:  # the same in every row
-        for item in rows.column(PERSISTENT)[0].as_py() or ():
-            found.append(dict(item) | {"column": "persistent", "timestamp": item["timestamp"] - start})
-    elif SUBTASK in rows.columns:
-        found += _subtasks(meta, rows, times - start)
-    if EVENTS in rows.columns:
-        for time, items in zip(times - start, rows.column(EVENTS).to_pylist(), strict=True):
-            found += [dict(item) | {"column": "events", "timestamp": float(time)} for item in items or ()]
-    return sorted(found, key=lambda item: float(item["timestamp"]))
 
 
 def _subtasks(meta: Metadata, rows: Rows, times: Floats) -> list[dict[str, Any]]:

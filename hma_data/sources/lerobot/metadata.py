@@ -212,7 +212,11 @@ class Metadata:
         self.info = _info(self._where)
         self.fps, self.features = self.info.fps, self.info.features
         self._is_v3 = is_v3 = self.info.codebase_version == "v3.0"
-        self.splits = _splits(self.info.splits)
+        self.splits = {  # ranges of episodes; lerobot uses no other form than `from:to`
+            name: range(int(match[1]), int(match[2]))
+            for name, text in self.info.splits.items()
+            if (match := re.fullmatch(r"(\d{1,12}):(\d{1,12})", str(text)))
+        }
         self.tasks = _by_number(numbered_texts(folder, "task") if is_v3 else _tasks_v2(folder))
         self.episodes = _by_index(_episodes_v3(folder) if is_v3 else _lines(folder, "episodes.jsonl"))
         self._spans: dict[str, dict[str, tuple[Span, ...]]] = {}  # camera -> video -> its episodes
@@ -359,12 +363,6 @@ def _lines(folder: Folder, name: str) -> Iterator[Row]:
             if not isinstance(row, dict):
                 raise SourceError(where, f"holds {row!r:.60}, not an object", "the dataset is damaged")
             yield where, row
-
-
-def _splits(found: dict[str, Any]) -> dict[str, range]:
-    """Return ranges of episodes by the split's name; lerobot uses no other form than `from:to`."""
-    matches = {name: re.fullmatch(r"(\d{1,12}):(\d{1,12})", str(text)) for name, text in found.items()}
-    return {name: range(int(match[1]), int(match[2])) for name, match in matches.items() if match}
 
 
 def _tasks_v2(folder: Folder) -> Iterator[tuple[Any, Any]]:
