@@ -10,7 +10,6 @@ from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.bags import segments
-from hma_data.sources.bags.container import Recent
 from tests.data.bag_files import SOURCE, START_NS
 from tests.data.bag_parts import KINDS, STATE, TASK, Said, make_run, parted, ros1
 
@@ -213,7 +212,7 @@ def test_an_episode_costs_about_its_own_bytes(kind: str, tmp_path: Path) -> None
 def test_a_bag_is_searched_for_its_episodes_once_on_a_machine(kind: str, tmp_path: Path, monkeypatch) -> None:
     path, size = written(kind, tmp_path)
     refs = SOURCE.index(str(path), parted(GAP))
-    monkeypatch.setattr(segments, "_tables", Recent(8))  # as in another process
+    monkeypatch.setattr(segments, "_tables", segments.Recent(8))  # as in another process
     before = read_bytes()
     assert SOURCE.index(str(path), parted(GAP)) == refs
     # The fingerprint reads up to three samples of 64 KiB.
