@@ -29,9 +29,7 @@ def test_every_kind_of_bag(bags: dict[str, Path], recording: Recording, kind: st
     values = inferred(bags[kind])
     assert keys(values, "action") == ["/command.data"] and keys(values, "state") == ["/joint_states.position"]
     assert values["state"]["components"][0]["names"] == ["shoulder", "elbow", "wrist"]
-    assert values["cameras"] == [{"name": "image", "key": "/cam/image.raw", "size": [24, 32]}] or (
-        values["cameras"][0]["key"] == "/cam/image.raw"
-    )
+    assert values["cameras"][0]["key"] == "/cam/image.raw"
     assert values["frequency_hz"] == 10 and "25 Hz" in values["provenance"]["frequency_hz"]
     assert values["sync"]["max_skew_ms"] == 60
     clip = first_clip(bags[kind], values)
@@ -123,16 +121,14 @@ def test_a_gripper_that_opens_and_closes_keeps_its_two_values(tmp_path: Path) ->
         assert gripper.get("normalize", True) is not kept
 
 
-def test_values_of_two_keys_have_names_of_their_own(tmp_path: Path) -> None:
+def test_values_of_two_keys_have_own_names_and_a_short_bag_a_rate_at_which_a_model_sees_enough(
+    tmp_path,
+) -> None:
     topics = {"/image": (picture_of(), 20), "/cmd_vel": (twist(), 20)}
     values = inferred(bag(tmp_path / "run", topics, seconds=4))
     names = [name for one in values["action"]["components"] for name in one["names"]]
     assert names == ["linear_x", "linear_y", "linear_z", "angular_x", "angular_y", "angular_z"]
-
-
-def test_a_short_bag_gets_a_rate_at_which_a_model_sees_enough(tmp_path: Path) -> None:
-    topics = {"/image": (picture_of(), 20), "/cmd_vel": (twist(), 20)}
-    assert inferred(bag(tmp_path / "run", topics, seconds=4))["target_hz"] == 6.667
+    assert values["target_hz"] == 6.667
 
 
 def test_a_goal_sent_once_or_twice_is_doubted(tmp_path: Path) -> None:

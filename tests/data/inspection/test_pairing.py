@@ -16,7 +16,7 @@ from tests.data.bag_files import START_NS, Recording, as_cdr, write_mcap, write_
 from tests.data.inferring import answered, first_clip, inferred
 
 MS = 1_000_000
-HZ, FRAMES = 20, 30
+FRAMES = 30
 PERIOD = 50 * MS
 DRAW = np.random.default_rng(0)
 

@@ -64,13 +64,9 @@ def test_a_uri_is_a_path_that_is_joined_listed_and_pickled(bucket: RemotePath) -
     assert copy.deepcopy(folder) == folder == place(Path(str(folder)))
 
 
-@pytest.mark.parametrize("name", ["here/there", "a:b", "C:/x", "/abs", "what:ever/x"])
-def test_paths_of_this_machine_stay_what_they_are(name: str) -> None:
-    assert place(name) == Path(name) and not store.is_remote(place(name))
-
-
-def test_file_uris_are_paths_of_this_machine() -> None:
-    assert place("file:///some/set") == Path("/some/set")
+@pytest.mark.parametrize("name", ["here/there", "a:b", "C:/x", "/abs", "what:ever/x", "file:///some/set"])
+def test_paths_and_file_uris_of_this_machine_stay_what_they_are(name: str) -> None:
+    assert place(name) == Path(name.removeprefix("file://")) and not store.is_remote(place(name))
 
 
 def test_a_scheme_that_no_store_has_is_refused() -> None:

@@ -1,7 +1,8 @@
-"""`taesd` and `taef2`: latents of tiny autoencoders, from either layout of their weights."""
+"""Latents of other autoencoders: `taesd` and `taef2` from either layout of their weights, and `svd-vae`."""
 
 import json
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +13,14 @@ from torch.nn import functional
 
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
-from hma_data.errors import TokenizerError
+from hma_data.errors import MissingDependencyError, TokenizerError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.preview import preview, tokenizer_of
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec, get_tokenizer
-from hma_data.tokenizers.latents import read_tiny
+from hma_data.tokenizers.latents import derive_svd_config, read_tiny
+from hma_data.tokenizers.training.eval import psnr_db
 from tests.conftest import write_toy
 from tests.data.tokenizer_files import altered, frames, tiny_halves, write_tiny_pair, write_tiny_whole
 
@@ -31,11 +33,6 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def tiny(weights: Path) -> Tokenizer:
     return get_tokenizer("taesd", weights=str(weights))
-
-
-def psnr_db(true: np.ndarray, made: np.ndarray) -> np.ndarray:
-    squared = ((true.astype(np.float64) - made) ** 2).mean(axis=(1, 2, 3))
-    return 10 * np.log10(255**2 / squared)
 
 
 def square(picture: np.ndarray) -> np.ndarray:
@@ -274,3 +271,105 @@ def test_the_pair_may_lie_among_other_files(real_data, tmp_path):
         shutil.copy(real_data / "weights" / f"taef2_{half}.pth", tmp_path)
     (tmp_path / "config.json").write_text('{"act_fn": "gelu"}')  # somebody else's
     assert get_tokenizer("taef2", weights=str(tmp_path)).spec.channels == 32
+
+
+# -- svd-vae
+
+
+SVD_NAME = "diffusion_pytorch_model.safetensors"
+
+
+@pytest.fixture(scope="module")
+def svd_theirs():
+    import diffusers
+
+    torch.manual_seed(0)
+    return diffusers.AutoencoderKLTemporalDecoder(
+        down_block_types=("DownEncoderBlock2D",) * 4, block_out_channels=(32, 32, 64, 64), layers_per_block=1
+    ).eval()
+
+
+@pytest.fixture(scope="module")
+def svd_folder(svd_theirs, tmp_path_factory):
+    path = tmp_path_factory.mktemp("svd")
+    svd_theirs.save_pretrained(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def svd(svd_folder) -> Tokenizer:
+    return get_tokenizer("svd-vae", weights=str(svd_folder))
+
+
+def test_without_diffusers_the_command_that_installs_it_is_named(tmp_path, monkeypatch):
+    save_file({"a": torch.ones(1)}, tmp_path / SVD_NAME)
+    monkeypatch.setitem(sys.modules, "diffusers", None)
+    with pytest.raises(MissingDependencyError, match="uv sync --inexact --extra svd"):
+        get_tokenizer("svd-vae", weights=str(tmp_path))
+
+
+@pytest.mark.slow
+def test_sizes_are_read_off_the_weights(svd_folder, svd_theirs):
+    derived = derive_svd_config(load_file(svd_folder / SVD_NAME))
+    assert all(
+        tuple(np.atleast_1d(svd_theirs.config[k])) == tuple(np.atleast_1d(v)) for k, v in derived.items()
+    )
+
+
+@pytest.mark.slow
+def test_latents_are_the_unscaled_mean_of_the_posterior(svd, svd_theirs):
+    pictures = frames(2)
+    pixels = torch.from_numpy(pictures).permute(0, 3, 1, 2).float() / 127.5 - 1
+    with torch.inference_mode():
+        mean = svd_theirs.encode(pixels).latent_dist.mean.numpy()
+    latents = svd.encode(pictures)
+    assert latents.shape == (2, 4, 32, 32) and latents.dtype == np.float16
+    np.testing.assert_allclose(latents, mean, atol=1e-3)
+    assert svd.spec.latent_scale == 0.18215
+
+
+@pytest.mark.slow
+def test_frames_are_decoded_one_by_one(svd, svd_theirs):
+    latents = svd.encode(frames(2))
+    with torch.inference_mode():
+        single = [svd_theirs.decode(torch.from_numpy(z[None]).float(), num_frames=1).sample for z in latents]
+    expected = ((torch.cat(single).clamp(-1, 1) + 1) * 127.5).permute(0, 2, 3, 1).numpy()
+    assert np.abs(svd.decode(latents) - expected).max() <= 0.51
+
+
+@pytest.mark.slow
+def test_svd_keeps_the_contract(svd):
+    spec = svd.spec
+    assert isinstance(svd, Tokenizer) and TokenizerSpec.from_json(spec.to_json()) == spec
+    assert (spec.kind, spec.grid, spec.channels, spec.dtype) == ("continuous", (32, 32), 4, "float16")
+    pictures = frames(3)
+    whole = svd.encode(pictures)
+    assert np.array_equal(np.concatenate([svd.encode(p[None]) for p in pictures]), whole)
+    assert {"encoder", "decoder"} <= {name for name, _ in svd.network.named_children()}
+
+
+@pytest.mark.slow
+def test_another_scale_in_the_config_is_kept(svd_folder, tmp_path):
+    save_file(load_file(svd_folder / SVD_NAME), tmp_path / SVD_NAME)
+    (tmp_path / "config.json").write_text(json.dumps({"scaling_factor": 0.5}))
+    assert get_tokenizer("svd-vae", weights=str(tmp_path)).spec.latent_scale == 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"decoder.time_conv_out.weight": None}, r"decoder\.time_conv_out\.weight"),
+        ({"encoder.conv_in.bias": None}, r"Missing key.*encoder\.conv_in\.bias"),
+        ({"post_quant_conv.weight": torch.ones(1)}, r"post_quant_conv\.weight"),
+        ({"quant_conv.weight": torch.ones(1, 8)}, "the weights of an AutoencoderKL|does not fit the network"),
+        (
+            {"encoder.down_blocks.0.resnets.0.conv1.weight": torch.ones(30, 3, 3, 3)},
+            "the weights of an AutoencoderKL",
+        ),
+    ],
+)
+def test_weights_of_another_network_than_svds_are_refused_by_name(svd_folder, tmp_path, changes, named):
+    save_file(altered(load_file(svd_folder / SVD_NAME), changes), tmp_path / SVD_NAME)
+    with pytest.raises(TokenizerError, match=named):
+        get_tokenizer("svd-vae", weights=str(tmp_path))

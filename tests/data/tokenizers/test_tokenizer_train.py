@@ -1,4 +1,4 @@
-"""The training of the embedded tokenizers: recipes, crops, optimizers, stopping and going on."""
+"""Training of tokenizers, discrete and continuous: what it makes, repeats, continues and refuses."""
 
 import subprocess
 import sys
@@ -11,18 +11,18 @@ from safetensors.torch import load_file
 
 from hma_data.errors import RecipeError, TokenizerError
 from hma_data.storage.paths import shipped
-from hma_data.tokenizers.base import get_tokenizer
+from hma_data.tokenizers.base import Tokenizer, get_tokenizer
 from hma_data.tokenizers.catalog import EMBEDDED
-from hma_data.tokenizers.checkpoints import read_weights
-from hma_data.tokenizers.embedded import FsqAutoencoder
-from hma_data.tokenizers.shapes import FsqConfig
-from hma_data.tokenizers.training.eval import psnr_db
+from hma_data.tokenizers.checkpoints import read_weights, save_weights
+from hma_data.tokenizers.embedded import FsqAutoencoder, VaeAutoencoder
+from hma_data.tokenizers.shapes import FsqConfig, VaeConfig
+from hma_data.tokenizers.training.eval import evaluate, psnr_db
 from hma_data.tokenizers.training.frames import draw_batch, load_pools
 from hma_data.tokenizers.training.muon import Muon, orthogonal
 from hma_data.tokenizers.training.recipe import DrawnSource, load_recipe
 from hma_data.tokenizers.training.train import start_from, train
 from tests.data import tokenizer_files
-from tests.data.tokenizer_files import Stopped, drawn_corpus, scenes, stop_at
+from tests.data.tokenizer_files import Stopped, draw_scene, drawn_corpus, scenes, stop_at
 
 RECIPE = shipped("recipes") / "tokenizer" / "fsq.yaml"
 SMALL = FsqConfig(width=(8, 8), hidden=8, encoder_blocks=(1, 1), decoder_blocks=(1, 1, 1), fine_width=4)
@@ -211,3 +211,75 @@ def test_weight_decay_bounds_the_norm_of_a_matrix_that_is_always_pushed_one_way(
 def test_training_leaves_denormal_numbers_as_they_were(tmp_path):
     train(write_recipe(tmp_path), tmp_path / "w", report=lambda _: None)
     assert float(torch.tensor(1e-40) * 1.0) > 0
+
+
+# -- continuous latents
+
+
+FORMAT = VaeConfig.format
+SMALL_VAE = VaeConfig(width=8, hidden=8, encoder_blocks=1, decoder_blocks=(1, 1), fine_width=4)
+
+
+@pytest.fixture(scope="module")
+def vae() -> Tokenizer:
+    return get_tokenizer("vae-8")
+
+
+@pytest.fixture(scope="module")
+def frames() -> np.ndarray:
+    rng = np.random.default_rng(6)
+    return np.stack([draw_scene(rng, 256) for _ in range(9)])
+
+
+def test_its_latents_are_four_channels_at_an_eighth(vae):
+    spec = vae.spec
+    assert (spec.kind, spec.channels, spec.grid, spec.dtype) == ("continuous", 4, (32, 32), "float16")
+
+
+def test_scaled_latents_have_about_unit_variance(vae, frames):
+    scaled = vae.encode(frames).astype(np.float64) * vae.spec.latent_scale
+    assert 0.6 < scaled.std() < 1.6 and abs(scaled.mean()) < 0.5
+
+
+def test_near_latents_decode_to_near_pictures(vae, frames):
+    latents = vae.encode(frames)
+    noise = np.random.default_rng(0).normal(0, 0.05, latents.shape)
+    plain, moved = vae.decode(latents), vae.decode((latents + noise).astype(np.float16))
+    assert psnr_db(plain, moved).mean() > 30
+
+
+@pytest.mark.parametrize("shape", [(1, 4, 16, 16), (1, 3, 32, 32), (4, 32, 32)])
+def test_latents_of_another_shape_are_refused(vae, shape):
+    with pytest.raises(TokenizerError, match="decodes"):
+        vae.decode(np.zeros(shape, np.float16))
+
+
+def test_weights_of_the_discrete_tokenizer_are_refused():
+    with pytest.raises(TokenizerError, match=r"does not hold hma-vae-1 weights \(format 'hma-fsq-1'\)"):
+        get_tokenizer("vae-8", weights=str(EMBEDDED / "fsq.safetensors"))
+
+
+def test_the_scale_belongs_to_the_spec(tmp_path):
+    digests = set()
+    for scale in (1.0, 0.5):
+        config = VaeConfig(**{**SMALL_VAE.model_dump(), "decoder_blocks": (1, 1), "latent_scale": scale})
+        torch.manual_seed(0)
+        path = tmp_path / f"{scale}.safetensors"
+        save_weights(path, FORMAT, config, dict(VaeAutoencoder(config).named_parameters()), {})
+        tokenizer = get_tokenizer("vae-8", weights=str(path))
+        assert tokenizer.spec.latent_scale == scale
+        digests.add(tokenizer.spec.digest)
+    assert len(digests) == 2
+
+
+def test_training_measures_the_scale_of_the_latents(tmp_path):
+    network = SMALL_VAE.model_dump(exclude={"latent_scale"})
+    recipe = tokenizer_files.write_recipe(tmp_path, network, pictures=6, steps=8)
+    train(recipe, tmp_path / "w", report=lambda _: None)
+    config, _, _ = read_weights(tmp_path / "w", FORMAT, VaeConfig)
+    assert config.latent_scale != 1.0
+    result = evaluate(
+        get_tokenizer("vae-8", weights=str(tmp_path / "w")),
+        [np.stack([draw_scene(np.random.default_rng(1), 256)])],
+    )
+    assert 0.3 < result["latent_std_scaled"] < 3

@@ -1,6 +1,5 @@
 """A recording that is not what was said, or is linked elsewhere: the error tells what to do."""
 
-import math
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from hma_data.conversion.job import convert
-from hma_data.errors import HMAError, OutputError, RegistryError, SourceError, StorageError, UsageError
+from hma_data.errors import HMAError, OutputError, SourceError, StorageError, UsageError
 from hma_data.inspection.inspect import examine, inspect_recording
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import Inspection, open_source
@@ -129,13 +128,6 @@ def test_an_out_that_cannot_be_named_is_one_clear_error(toy_arm: Embodiment, tmp
         convert(toy_arm, str(tmp_path / "toy.hdf5"), BlockTokenizer(), tmp_path / ("n" * 300))
 
 
-@pytest.mark.parametrize("hz", [0.0, math.nan, math.inf])
-def test_a_rate_that_cannot_be_meant_is_refused(hz: float, toy_arm: Embodiment) -> None:
-    unknown = Embodiment.from_values(toy_arm.to_dict() | {"frequency_hz": "unknown"}, "toy")
-    with pytest.raises(RegistryError, match="frequency_hz"):
-        unknown.with_rate(hz)
-
-
 def test_options_that_cannot_be_meant_are_wrong_usage(tmp_path: Path) -> None:
     options = ["--out", str(tmp_path / "out"), "--extend", "--overwrite"]
     result = CliRunner().invoke(app, ["convert", "-e", "x", *options])
@@ -210,3 +202,20 @@ def test_inspect_tells_of_linked_folders_and_of_links_to_nothing(name, elsewhere
         f"{root}/day3 is a link to {tmp_path}/lost, which is not there": "warn",
     }
     assert source.inspect(str(root / "day1")).episodes == 1
+
+
+# -- packed recordings
+
+
+@pytest.mark.parametrize(
+    ("name", "tool"),
+    [("run.bag.gz", "gunzip"), ("x.h5.gz", "gunzip"), ("a.mcap.GZ", "gunzip"), ("all.zip", "unzip"),
+     ("all.tar", "tar xf"), ("all.tar.gz", "tar xf"), ("all.tgz", "tar xf"), ("run.bag.zst", "unzstd")],
+)  # fmt: skip
+def test_a_packed_recording_is_to_be_unpacked(tmp_path: Path, name: str, tool: str) -> None:
+    (tmp_path / "notes.txt").write_text("day one")
+    (tmp_path / name).write_bytes(b"\x1f\x8b\x08" + bytes(40))
+    for uri in (tmp_path, tmp_path / name):
+        with pytest.raises(SourceError) as told:
+            detect(str(uri))
+        assert f"{name} is packed: unpack it first, as with `{tool} {name}`" in str(told.value)

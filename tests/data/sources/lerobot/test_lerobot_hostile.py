@@ -35,18 +35,6 @@ def column(name: str, content: list[Any]) -> Edit:
     return of(ROWS, edit)
 
 
-def a_row_less(path: Path) -> None:
-    pq.write_table(pq.read_table(path).slice(1), path)
-
-
-def nameless(path: Path) -> None:
-    pq.write_table(pq.read_table(path).drop_columns(["episode_index"]), path)
-
-
-def many_rows(path: Path) -> None:
-    pq.write_table(pa.table({"episode_index": [0] * 1001}), path)
-
-
 def sees(key: str) -> dict[str, Any]:
     return {"cameras": [{"name": "cam", "key": key}]}
 
@@ -64,10 +52,19 @@ ONE: dict[str, Row] = {  # one episode is refused
     "a film cut short": (of(FILM, cut(900)), r"episode_000000\.mp4: .* cut off"),
     "no rows": (of(ROWS, Path.unlink), r"episode_000000\.parquet"),
     "rows cut short": (of(ROWS, cut(500)), r"episode_000000\.parquet: .*copy it again"),
-    "a row less": (of(ROWS, a_row_less), "has 11 rows of episode_000000, its metadata says 12"),
+    "a row less": (
+        of(ROWS, lambda path: pq.write_table(pq.read_table(path).slice(1), path)),
+        "has 11 rows of episode_000000, its metadata says 12",
+    ),
     "more rows than can be": (of(LISTED, swap('"length": 12', f'"length": {2**63}')), "its metadata says 9"),
-    "rows of no episode": (of(ROWS, nameless), "has no column 'episode_index' — it has action"),
-    "too many rows": (of(ROWS, many_rows), "'episode_index' claims 1,001 values of 1,001 rows"),
+    "rows of no episode": (
+        of(ROWS, lambda path: pq.write_table(pq.read_table(path).drop_columns(["episode_index"]), path)),
+        "has no column 'episode_index' — it has action",
+    ),
+    "too many rows": (
+        of(ROWS, lambda path: pq.write_table(pa.table({"episode_index": [0] * 1001}), path)),
+        "'episode_index' claims 1,001 values of 1,001 rows",
+    ),
     "a list too short": (column("action", [PAIR] * 11 + [[1.0]]), "holds lists of"),
     "a row without action": (column("action", [PAIR] * 11 + [None]), "1 missing values"),
     "rows without numbers": (column("action", [[1.0, None]] * 12), "12 missing values"),

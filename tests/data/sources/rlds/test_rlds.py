@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hma_data.episodes.align import to_clip
-from hma_data.errors import EpisodeError, HMAError, SourceError, StorageError
+from hma_data.errors import EpisodeError, HMAError, SourceError
 from hma_data.registry.embodiment import Embodiment, find
 from hma_data.sources.base import open_source
 from hma_data.sources.detect import detect
@@ -372,11 +372,6 @@ def test_inspection_lists_every_key_of_a_step(tmp_path):
 
 
 # -- what is refused
-
-
-def test_a_file_system_that_is_not_known_or_not_installed():
-    with pytest.raises(StorageError, match="is of no store that is known"):
-        RLDS.index("nosuch://bucket/data")
 
 
 @pytest.mark.parametrize("name", ["train/000009", "train/-1", "test/000000", "train", "../x/000000", ""])
