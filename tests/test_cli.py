@@ -8,7 +8,7 @@ import pytest
 
 from hma_data.errors import UsageError
 from hma_model.cli import main
-from tests.command import ROOT, fails, hma, hma_process
+from tests.command import fails, hma, hma_process
 from tests.conftest import ARM_YAML
 from tests.data.fresh import run_fresh
 
@@ -133,14 +133,24 @@ def test_infer_writes_a_yaml_whose_questions_validate_lists(toy_yaml: Path, tmp_
     fails(hma("registry", "infer", tmp_path / "toy.hdf5", "--id", "mine", "--out", out), 1, "exists")
 
 
-def test_wrong_usage_is_exit_code_two() -> None:
-    fails(hma("inspect"), 2, "Missing argument")
-    fails(hma("convert", "--nonsense"), 2, "--nonsense")
-    fails(hma("registry", "infer", str(ROOT), "--id", "Not An Id"), 2, "Not An Id")
-
-
-def test_an_unknown_embodiment_names_near_ones() -> None:
-    fails(hma("convert", "-e", "pusht_fats", "--out", "/nonexistent/o"), 1, "pusht_fast", "registry list")
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        ("inspect", 2, ["Missing argument"]),
+        ("convert --nonsense", 2, ["--nonsense"]),
+        ("registry infer . --id Not-An-Id", 2, ["Not-An-Id"]),
+        ("convert -e pusht_fats --out /nonexistent/o", 1, ["pusht_fast", "registry list"]),
+        ("convert -e toy_arm.yaml --source no.hdf5 --out o", 1, ["no.hdf5"]),
+        ("inspect empty", 1, ["holds no files"]),
+        ("shards info empty", 1, ["manifest.json"]),
+        ("mixture none", 1, ["not a folder"]),
+    ],
+)
+def test_what_is_wrong_is_one_line_and_wrong_usage_exit_code_two(
+    toy_yaml, tmp_path, words, code, said
+) -> None:
+    (tmp_path / "empty").mkdir()
+    fails(hma(*words.split(), cwd=tmp_path), code, *said)
 
 
 def test_a_wrong_yaml_lists_every_problem(toy_yaml: Path, tmp_path: Path) -> None:
@@ -150,22 +160,8 @@ def test_a_wrong_yaml_lists_every_problem(toy_yaml: Path, tmp_path: Path) -> Non
     assert not (tmp_path / "o").exists()
 
 
-def test_a_missing_recording_and_a_folder_of_nothing(toy_yaml: Path, tmp_path: Path) -> None:
-    out = str(tmp_path / "o")
-    fails(hma("convert", "-e", toy_yaml, "--source", str(tmp_path / "no.hdf5"), "--out", out), 1, "no.hdf5")
-    (tmp_path / "empty folder").mkdir()
-    fails(hma("inspect", str(tmp_path / "empty folder")), 1, "holds no files")
-
-
 def test_debug_shows_the_traceback(tmp_path: Path) -> None:
     assert "Traceback" in hma_process("inspect", str(tmp_path / "no"), "--debug").stderr
-
-
-def test_not_a_shard_set(tmp_path: Path) -> None:
-    fails(hma("shards", "info", str(tmp_path)), 1, "manifest.json")
-    done = hma("shards", "verify", str(tmp_path))
-    assert done.returncode == 1
-    fails(hma("mixture", str(tmp_path / "none")), 1, "not a folder")
 
 
 def test_a_target_above_the_recorded_rate_is_noted(tmp_path: Path) -> None:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from hma_data.storage.remote import RemotePath
 from tests.conftest import contents
+from tests.data.fresh import ROOT
 
-ROOT = Path(__file__).parents[3]
 SCRIPT = """
 import os, signal, sys, time
 from pathlib import Path

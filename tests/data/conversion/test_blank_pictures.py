@@ -61,12 +61,9 @@ def as_lerobot(folder: Path) -> tuple[Embodiment, Path, dict[str, str]]:
     for number, kind in enumerate(KINDS):
         path = folder / f"set/videos/chunk-000/{videos.CAMERA}/episode_{number:06d}.mp4"
         videos.encode(path, range(LENGTH), gop=LENGTH, b_frames=0, draw=pictures(kind).__getitem__)
-    robot = lerobot_arm()
-    return replace_camera(robot), folder / "set", {kind: str(i) for i, kind in enumerate(KINDS)}
-
-
-def replace_camera(robot: Embodiment) -> Embodiment:
-    return Embodiment.from_values(robot.to_dict() | {"cameras": [{"name": "top", "key": videos.CAMERA}]}, "")
+    cameras = [{"name": "top", "key": videos.CAMERA}]
+    robot = Embodiment.from_values(lerobot_arm().to_dict() | {"cameras": cameras}, "")
+    return robot, folder / "set", {kind: str(i) for i, kind in enumerate(KINDS)}
 
 
 def as_bags(folder: Path) -> tuple[Embodiment, Path, dict[str, str]]:
@@ -165,15 +162,12 @@ def test_a_colour_of_its_own_is_blank_too() -> None:
     assert check(np.full((3, 64, 64, 3), (0, 0, 255), np.uint8)).blank
 
 
-def test_a_dark_scene_and_a_small_light_are_not_blank() -> None:
+def test_a_dark_scene_a_small_light_and_a_brightness_that_changes_are_not_blank() -> None:
     scene = skimage_data.chelsea()[:256, :256][None].repeat(3, axis=0)
     assert not check(scene // 8).blank
     light = np.zeros((3, 256, 256, 3), np.uint8)
     light[:, 100:108, 100:108] = 255
     assert not check(light).blank
-
-
-def test_a_brightness_that_changes_is_not_blank() -> None:
     frames = np.zeros((8, 64, 64, 3), np.uint8) + np.arange(0, 80, 10, dtype=np.uint8)[:, None, None, None]
     assert not check(frames).blank
 

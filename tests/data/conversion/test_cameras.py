@@ -222,13 +222,6 @@ def test_a_choice_that_matches_nothing_is_one_error(only: list[str], exclude: li
     assert words in str(fault.value)
 
 
-@pytest.fixture
-def arm_yaml(tmp_path: Path) -> Path:
-    path = tmp_path / "toy_arm.yaml"
-    path.write_text(ARM_YAML)
-    return path
-
-
 def run(robot: Embodiment, source: Path, out: Path, **settings):
     return convert(robot, source, BlockTokenizer(), out, settings=Settings(val_fraction=0, **settings))
 
@@ -281,9 +274,9 @@ def test_a_plan_without_a_choice_states_none(tmp_path, toy_arm, toy_recording) -
     assert plain["hash"] != chosen["hash"]
 
 
-def test_the_command_counts_what_it_leaves_out(tmp_path, arm_yaml) -> None:
+def test_the_command_counts_what_it_leaves_out(tmp_path, toy_yaml) -> None:
     write_toy(tmp_path / "toy.hdf5", [8, 8, 8, 8])
-    words = ["convert", "-e", arm_yaml, "--source", tmp_path / "toy.hdf5", "--tokenizer", "fsq-8"]
+    words = ["convert", "-e", toy_yaml, "--source", tmp_path / "toy.hdf5", "--tokenizer", "fsq-8"]
     words += ["--out", tmp_path / "out", "--workers", "0"]
     planned = hma(*words, "--dry-run", "--exclude", "demo_0", "--exclude", "demo_2")
     assert "2 episodes, about 16 recorded frames" in planned.stdout
@@ -293,14 +286,14 @@ def test_the_command_counts_what_it_leaves_out(tmp_path, arm_yaml) -> None:
     fails(hma(*words, "--dry-run", "--only", "demo_9"), 2, "--only: 'demo_9' matches no episode", "demo_")
 
 
-def test_inspect_and_doctor_take_the_episodes_that_a_yaml_chooses(tmp_path, toy_recording, arm_yaml) -> None:
-    arm_yaml.write_text(ARM_YAML.replace("format: hdf5", "format: hdf5, only: [demo_5]"))
-    report = json.loads(hma("inspect", toy_recording, "-e", arm_yaml, "--json").stdout)
+def test_inspect_and_doctor_take_the_episodes_that_a_yaml_chooses(toy_yaml, toy_recording) -> None:
+    toy_yaml.write_text(ARM_YAML.replace("format: hdf5", "format: hdf5, only: [demo_5]"))
+    report = json.loads(hma("inspect", toy_recording, "-e", toy_yaml, "--json").stdout)
     assert report["embodiment"]["first episode"].startswith("demo_5:")
 
 
 def test_a_recording_whose_name_is_not_utf8_is_refused_before_the_work(
-    tmp_path: Path, arm_yaml: Path, toy_recording: Path
+    tmp_path: Path, toy_yaml: Path, toy_recording: Path
 ) -> None:
     """Neither a YAML nor a shard can state such a name."""
     odd = tmp_path / os.fsdecode(b"r\xe9c.hdf5")
@@ -311,6 +304,6 @@ def test_a_recording_whose_name_is_not_utf8_is_refused_before_the_work(
     words = [r"r\udce9c.hdf5: its name is not UTF-8 text — rename it"]
     fails(hma("registry", "infer", odd, "--id", "mine", "--out", tmp_path / "mine.yaml"), 1, *words)
     assert not (tmp_path / "mine.yaml").exists()
-    start = ("convert", "-e", arm_yaml, "--tokenizer", "fsq-8")
+    start = ("convert", "-e", toy_yaml, "--tokenizer", "fsq-8")
     fails(hma(*start, "--source", odd, "--out", tmp_path / "out"), 1, *words)
     assert not (tmp_path / "out").exists()

@@ -23,10 +23,10 @@ from hma_data.errors import HMAError, MissingDependencyError, TokenizerError
 from tests.conftest import SMALL as SETTINGS
 from tests.conftest import contents
 from tests.data.conversion.test_engines import PLAIN, MakeWork, Unit
+from tests.data.fresh import ROOT
 
 on_a_cluster = pytest.mark.slow
 LIMITS = Limits(quiet_s=5, kills=4)
-ROOT = Path(__file__).parents[3]
 
 
 @pytest.fixture(scope="module")

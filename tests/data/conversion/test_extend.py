@@ -83,20 +83,12 @@ def set_value(key: str, index: int) -> Change:
     return change
 
 
-def name_task(file: h5py.File) -> None:
-    file["data/demo_1"].attrs["language_instruction"] = "another task"
-
-
-def lose_pictures(file: h5py.File) -> None:
-    del file["data/demo_1/obs"]
-
-
 CHANGES = {
     "an action": set_value("actions", 7),
     "its first picture": set_value("obs/image", 0),
     "its last picture": set_value("obs/image", 20),
-    "its instruction": name_task,
-    "its pictures, which cannot be read": lose_pictures,
+    "its instruction": lambda file: file["data/demo_1"].attrs.update(language_instruction="another task"),
+    "its pictures, which cannot be read": lambda file: file["data/demo_1"].pop("obs"),
 }
 
 

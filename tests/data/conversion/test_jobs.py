@@ -34,9 +34,8 @@ from tests.command import hma
 from tests.conftest import SMALL, BlockTokenizer, contents, write_toy
 from tests.conftest import convert_toy as run
 from tests.data.conversion.jobs import ends, files, start
+from tests.data.fresh import ROOT
 from tests.hostile import at_once
-
-ROOT = Path(__file__).parents[3]
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,6 @@ from tests.data.episodes.test_align import STEADY, embodiment, episode
 from tests.hostile import at_once
 
 TIMED_YAML = ARM_YAML.replace("{format: hdf5}", "{format: hdf5, layout: {timestamps: t}}")
-WHOLE = Settings(val_fraction=0.2, shard_frames=60)
 
 
 def timed(folder: Path, rates: list[float]) -> Path:
@@ -45,7 +44,7 @@ def timed(folder: Path, rates: list[float]) -> Path:
     return path
 
 
-def made(path: Path, out: Path, settings: Settings = WHOLE, yaml: str = TIMED_YAML):
+def made(path: Path, out: Path, settings: Settings = SMALL, yaml: str = TIMED_YAML):
     return convert(Embodiment.from_yaml(yaml), path, BlockTokenizer(), out, settings=settings)
 
 
@@ -159,7 +158,7 @@ def test_a_set_without_a_window_is_told_with_what_gives_one(lengths, yaml, said,
 
 @pytest.mark.parametrize("frames", ["all", "strided"])
 def test_the_warning_has_both_rates_and_what_to_do(frames, tmp_path: Path) -> None:
-    settings = replace(WHOLE, frames=frames)
+    settings = replace(SMALL, frames=frames)
     summary = made(timed(tmp_path, [10, 5, 5, 5]), tmp_path / "out", settings)
     said = "3 of 4 episodes have another rate than the stated 10 Hz, such as demo_1 with 5 Hz"
     remedy = "correct frequency_hz, and convert again with --overwrite"
@@ -324,14 +323,10 @@ def test_a_share_of_a_finished_set_writes_nothing_where_nothing_has_changed(toy_
     assert (out / "manifest.json").stat().st_mtime_ns == before
 
 
-def first_day(folder: Path) -> Path:
-    (folder / "recorded").mkdir()
-    write_toy(folder / "recorded/monday.hdf5", range(20, 26))
-    return folder / "recorded"
-
-
 def test_an_extended_set_takes_the_stride_with_and_without_new_episodes(tmp_path) -> None:
-    recording, out = first_day(tmp_path), tmp_path / "out"
+    recording, out = tmp_path / "recorded", tmp_path / "out"
+    recording.mkdir()
+    write_toy(recording / "monday.hdf5", range(20, 26))
     run(robot(1), recording, out)
     write_toy(recording / "tuesday.hdf5", range(20, 26))
     extended = run(robot(5), recording, out, extend=True)

@@ -95,7 +95,7 @@ def test_split_refuses_what_it_cannot_do(made: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "a").exists()
 
 
-def test_merge_holds_every_episode_of_every_set(made: Path, tmp_path: Path) -> None:
+def test_merge_holds_every_episode_of_every_set_in_its_split(made: Path, tmp_path: Path) -> None:
     other = make(tmp_path / "other", [11, 12, 13])
     merge([made, other], tmp_path / "all")
     assert verify(tmp_path / "all") == []
@@ -109,12 +109,6 @@ def test_merge_holds_every_episode_of_every_set(made: Path, tmp_path: Path) -> N
         assert merged[f"2/{name}"][1:] == stored[1:]
     sources = set(table["source"].to_pylist())
     assert sources == {ShardSet(made).manifest.source, ShardSet(other).manifest.source}
-
-
-def test_merge_keeps_the_split_of_each_episode(made: Path, tmp_path: Path) -> None:
-    other = make(tmp_path / "other", [11, 12, 13])
-    merge([made, other], tmp_path / "all")
-    table = ShardSet(tmp_path / "all").episodes
     splits = [*ShardSet(made).episodes["split"].to_pylist(), *ShardSet(other).episodes["split"].to_pylist()]
     assert table["split"].to_pylist() == splits
 

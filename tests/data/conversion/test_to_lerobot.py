@@ -125,7 +125,8 @@ def test_lerobot_reads_what_the_shards_hold(kind: str, frames: str, tmp_path: Pa
     rows = dataset.meta.episodes
     assert len(listed) == dataset.meta.total_episodes == summary.manifest.to_json()["totals"]["episodes"]
     by_id = {row["id"]: row for row in listed}
-    for place, row in enumerate(numbered(tmp_path / "out")):
+    for place, row in enumerate(pq.read_table(tmp_path / "out/episodes.parquet").to_pylist()):
+        assert row["episode_index"] == place
         held = by_id[row["id"]]
         start, stop = rows[place]["dataset_from_index"], rows[place]["dataset_to_index"]
         assert (row["row_start"], stop - start) == (start, held["rows"])
@@ -147,12 +148,6 @@ def test_lerobot_reads_what_the_shards_hold(kind: str, frames: str, tmp_path: Pa
                 assert np.abs(seen.astype(int) - stored).mean() < 3, (name, at)
     assert len({file.stat().st_mode for file in (tmp_path / "out").rglob("*.*") if file.is_file()}) == 1
     assert ("recorded_time" in dataset.features) == (kind == "bag" or frames == "strided")
-
-
-def numbered(folder: Path) -> list[dict]:
-    rows = pq.read_table(folder / "episodes.parquet").to_pylist()
-    assert [row["episode_index"] for row in rows] == list(range(len(rows)))
-    return rows
 
 
 @pytest.mark.slow

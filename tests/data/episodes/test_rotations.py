@@ -88,11 +88,6 @@ def test_angles_go_over_the_seam_and_stay_in_their_range(turn, convention) -> No
 
 
 def test_angles_that_never_jump_are_interpolated_as_any_number() -> None:
-    values = np.linspace([0, -30, 2], [25, 4, 3], 6).astype(np.float32)  # several turns, wound on
-    plain = np.stack([np.interp(TARGETS, SAMPLES, column) for column in values.T], axis=1)
-    np.testing.assert_allclose(
-        between(SAMPLES[:1], values[:1], TARGETS, "euler_xyz"), values[[0] * len(TARGETS)]
-    )
     steps = np.linspace([0, -3, 2], [2.5, 0.4, 3], 6).astype(np.float32)
     plain = np.stack([np.interp(TARGETS, SAMPLES, column) for column in steps.T], axis=1)
     np.testing.assert_allclose(between(SAMPLES, steps, TARGETS, "euler_xyz"), plain, atol=1e-6)

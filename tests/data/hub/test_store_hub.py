@@ -285,15 +285,11 @@ def test_an_upload_cut_at_any_request_is_ended_by_the_same_command(
     assert 20 < at < 200 - step
 
 
-def other_machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("HMA_CACHE", str(tmp_path / "hma of another"))
-
-
 def test_two_jobs_of_one_conversion_at_once_make_it_together(
     toy_arm, toy_file, hub, whole, monkeypatch, tmp_path
 ) -> None:
     def other() -> None:
-        other_machine(monkeypatch, tmp_path)
+        monkeypatch.setenv("HMA_CACHE", str(tmp_path / "hma of another machine"))
         run(toy_arm, toy_file)
         monkeypatch.setenv("HMA_CACHE", str(tmp_path / "hma"))
 

@@ -68,10 +68,6 @@ def foxglove(ns: int, name: str, data: bytes):
     return VIDEO(ros2.stamp(ns), "x", np.frombuffer(data, np.uint8), name.split()[0])
 
 
-def labelled(format_: str):
-    return lambda ns, name, data: ros2.compressed(ns, format_.format(name.split()[0]), data)
-
-
 IN_ORDER = [(i, i) for i in range(FRAMES)]
 
 
@@ -120,7 +116,10 @@ def test_an_episode_in_reordered_video_has_its_own_frames(tmp_path: Path) -> Non
 @pytest.mark.parametrize("name", ["h264", "h264 with B-frames", "h265"])
 @pytest.mark.parametrize("format_", ["{}", "bgr8; {} compressed", "jpeg", ""])
 def test_video_in_compressed_images_is_read_as_video(name: str, format_: str, tmp_path: Path) -> None:
-    path = bag(tmp_path / "run", name, labelled(format_))
+    def labelled(ns: int, name: str, data: bytes):
+        return ros2.compressed(ns, format_.format(name.split()[0]), data)
+
+    path = bag(tmp_path / "run", name, labelled)
     assert pairs(path, robot()) == IN_ORDER
     camera = next(key for key in SOURCE.inspect(str(path)).keys if key.key == "/cam")
     assert (camera.kind, camera.codec, camera.shape) == ("camera", name.split()[0], (96, 96, 3))

@@ -68,8 +68,9 @@ def test_numbered_episodes_with_pauses_between_stay_apart(kind: str, tmp_path: P
     assert SOURCE.episode_ids(str(folder)) == ["rec_0", "rec_1", "rec_2"]
 
 
-def test_a_missing_part_divides_the_recording(tmp_path: Path) -> None:
+def test_a_part_given_alone_is_read_alone_and_a_missing_one_divides_the_recording(tmp_path: Path) -> None:
     folder = split(tmp_path / "run", "mcap", 5)
+    assert len(pairs(folder / "rec_1.mcap", robot(), "rec_1")) == 3
     (folder / "rec_2.mcap").unlink()
     ids = SOURCE.episode_ids(str(folder))
     assert len(ids) == 2
@@ -119,11 +120,6 @@ def test_an_inspection_keeps_few_bags_unpacked_and_unpacks_the_only_one_once(tmp
     kept.clear()
     assert SOURCE.inspect(str(folder / "rec_5.mcap.zstd")).frames == 3
     assert len(kept) == 1
-
-
-def test_one_part_given_alone_is_read_alone(tmp_path: Path) -> None:
-    folder = split(tmp_path / "run", "mcap", 3)
-    assert len(pairs(folder / "rec_1.mcap", robot(), "rec_1")) == 3
 
 
 @pytest.mark.parametrize("kind", KINDS)

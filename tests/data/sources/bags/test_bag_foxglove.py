@@ -19,7 +19,7 @@ from hma_data.inspection.inspect import examine, inspect_recording
 from hma_data.sources.bags.bag import Bag
 from hma_data.sources.bags.container import Channel, RecordFilter
 from hma_data.sources.bags.messages import decode, numbers
-from hma_data.tokenizers.base import TokenizerSpec
+from hma_data.tokenizers import get_tokenizer
 from hma_data.tokenizers.training.frames import recording_films
 from tests.data import bag_parts
 from tests.data.bag_files import (
@@ -45,7 +45,6 @@ FIELDS = {
     "RawImage": "string frame_id\nuint32 width\nuint32 height\nstring encoding\nuint32 step\nuint8[] data\n",
     "CompressedVideo": "string frame_id\nuint8[] data\nstring format\n",
 }
-NUMBERS = "float64 value\n"
 
 
 def png(picture: np.ndarray) -> np.ndarray:
@@ -195,14 +194,8 @@ def test_inspect_doctor_and_eval_look_at_the_embodiments_episodes(tmp_path, monk
 
     monkeypatch.setattr(type(SOURCE), "read", spy)
     examine(str(path), str(where))
-    list(recording_films(robot, str(path), _spec(), frames=2))
+    list(recording_films(robot, str(path), get_tokenizer("raw").spec, frames=2))
     assert asked == ["run/0000", "run/0001", "run/0002"] * 2
-
-
-def _spec() -> TokenizerSpec:
-    from hma_data.tokenizers import get_tokenizer
-
-    return get_tokenizer("raw").spec
 
 
 @pytest.mark.parametrize("left_out", [(), ("google/protobuf/timestamp.proto",)])

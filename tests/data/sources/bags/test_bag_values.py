@@ -1,6 +1,7 @@
 """Which numbers of a message become an action: by name wherever names stand, and those that move."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -40,21 +41,19 @@ def named_array(ns: int, names: list[str], values: list[float]):
     return T["toy/msg/NamedArray"](ros2.header(ns), motors)
 
 
-def above(ns: int, names: list[str], values: list[float]):
-    return T["toy/msg/Above"](ros2.header(ns), names, T["toy/msg/Inner"](np.array(values)))
-
-
 MESSAGES = {
     "/cmd.position": ros2.joints,
     "/cmd.points[0].positions": trajectory,
     "/cmd.motors.q": named_array,
-    "/cmd.inner.values": above,
+    "/cmd.inner.values": lambda ns, names, values: T["toy/msg/Above"](
+        ros2.header(ns), names, T["toy/msg/Inner"](np.array(values))
+    ),
 }
 
 
-def picked(key: str, names: tuple[str, ...]) -> Embodiment:
+def picked(key: str, dims: int, **more: Any) -> Embodiment:
     values = robot().to_dict()
-    values["action"]["components"] = [{"key": key, "dims": len(names), "names": list(names)}]
+    values["action"]["components"] = [{"key": key, "dims": dims, **more}]
     return Embodiment.from_values(values, "")
 
 
@@ -68,28 +67,22 @@ def shuffled_bag(path: Path, key: str) -> Path:
     return ros2.write(path, messages)
 
 
-@pytest.mark.parametrize("key", MESSAGES)
-def test_names_pick_the_values_wherever_a_message_has_them(key: str, tmp_path: Path) -> None:
-    path = shuffled_bag(tmp_path / "run", key)
-    for names in (NAMES, ("elbow", "pan")):
-        episode = SOURCE.read(str(path), "run", picked(key, names))
-        expected = [[100.0 * NAMES.index(name) + i for name in names] for i in range(FRAMES)]
-        np.testing.assert_array_equal(episode.actions[0].values, expected)
-
-
 @pytest.mark.parametrize("key", [*MESSAGES, "/cmd.position[0:3]"])
 def test_joints_that_change_places_are_refused_without_names(key: str, tmp_path: Path) -> None:
     path = shuffled_bag(tmp_path / "run", key.removesuffix("[0:3]"))
-    values = robot().to_dict() | {"action": {"space": "mixed", "components": [{"key": key, "dims": 3}]}}
     with pytest.raises(EpisodeError, match=r"is of \w+, \w+, \w+, then of .* — give the component names"):
-        SOURCE.read(str(path), "run", Embodiment.from_values(values, ""))
+        SOURCE.read(str(path), "run", picked(key, 3))
 
 
 @pytest.mark.parametrize("key", MESSAGES)
-def test_infer_names_them(key: str, tmp_path: Path) -> None:
+def test_names_pick_the_values_wherever_a_message_has_them_and_infer_names_them(key, tmp_path: Path) -> None:
     path = shuffled_bag(tmp_path / "run", key)
     (found,) = [info for info in SOURCE.inspect(str(path)).keys if info.key == key]
     assert sorted(found.names) == sorted(NAMES)
+    for names in (NAMES, ("elbow", "pan")):
+        episode = SOURCE.read(str(path), "run", picked(key, len(names), names=list(names)))
+        expected = [[100.0 * NAMES.index(name) + i for name in names] for i in range(FRAMES)]
+        np.testing.assert_array_equal(episode.actions[0].values, expected)
 
 
 def test_a_list_of_other_texts_names_nothing() -> None:
@@ -114,9 +107,7 @@ def test_infer_takes_the_fields_that_move_not_counters_and_checksums(tmp_path: P
 
 def test_a_field_of_a_list_is_read_from_each_and_may_be_sliced(tmp_path: Path) -> None:
     path = motors_bag(tmp_path / "run")
-    values = robot().to_dict()
-    values["action"]["components"] = [{"key": "/lowcmd.motor_cmd[1:3].q", "dims": 2}]
-    episode = SOURCE.read(str(path), "run", Embodiment.from_values(values, ""))
+    episode = SOURCE.read(str(path), "run", picked("/lowcmd.motor_cmd[1:3].q", 2))
     expected = [[i + 0.01, i + 0.02] for i in range(FRAMES)]
     np.testing.assert_allclose(episode.actions[0].values, expected, atol=1e-5)
 
@@ -154,6 +145,3 @@ def test_a_key_reads_the_type_that_has_its_field_and_infer_asks(tmp_path: Path) 
     assert any(said in problem for problem in SOURCE.inspect(str(path)).problems)
     asked = parse_yaml(infer(str(path), "x"), "x")["provenance"]["action"]
     assert asked.startswith("TODO") and said in asked
-
-
-# -- descriptors of protobuf

@@ -265,15 +265,13 @@ def test_links_of_the_hub_cache_are_followed(bags, recording, kind, tmp_path) ->
         np.testing.assert_array_equal(episode.streams["front"].frames([0, 9]), recording.pictures[[0, 9]])
 
 
-def later(recording: Recording, by_ns: int) -> Recording:
-    times = {name: getattr(recording, name) + by_ns for name in ("picture_ns", "joint_ns", "command_ns")}
-    return replace(recording, **times)
-
-
 def test_a_ros2_folder_in_several_files_is_one_episode(tmp_path: Path, recording: Recording) -> None:
     folder = tmp_path / "split"
     folder.mkdir()
-    parts = [later(make_recording(4, seed=i), 400_000_000 * i) for i in range(3)]
+    parts = []
+    for i in range(3):
+        part, names = make_recording(4, seed=i), ("picture_ns", "joint_ns", "command_ns")
+        parts.append(replace(part, **{name: getattr(part, name) + 400_000_000 * i for name in names}))
     for i in range(3):
         part = KINDS["mcap-cdr-zstd"](tmp_path, parts[i])
         part.rename(folder / f"split_{i}.mcap")

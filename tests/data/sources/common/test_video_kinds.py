@@ -218,13 +218,9 @@ def film(path: Path, matrix: int, full: bool, codec: str = "libx264", kind: str 
     return path
 
 
-def frame_of(path: Path) -> av.VideoFrame:
-    with av.open(str(path)) as container:
-        return next(iter(container.decode(video=0)))
-
-
 def by_ffmpeg(path: Path) -> np.ndarray:
-    frame, graph = frame_of(path), av.filter.Graph()
+    with av.open(str(path)) as container:
+        frame, graph = next(iter(container.decode(video=0))), av.filter.Graph()
     steps = (
         graph.add_buffer(width=SIDE, height=SIDE, format=frame.format, time_base=frame.time_base),
         graph.add("scale"),
