@@ -4,6 +4,7 @@ Each format has one table of hostile recordings: name -> how it is made, and wha
 """
 
 import json
+import os
 import re
 import shutil
 import tempfile
@@ -66,6 +67,16 @@ def linked_away(path: Path) -> None:
     elsewhere = Path(tempfile.mkdtemp()) / path.name
     shutil.move(path, elsewhere)
     path.symlink_to(elsewhere)
+
+
+class Touch:
+    """Make a file when it is unpickled: what a hostile pickle can do."""
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Callable[[str], int], tuple[str]]:
+        return os.system, (f"touch '{self.path}'",)
 
 
 def untouched(path: Path) -> None:

@@ -272,11 +272,6 @@ def small_batches(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(augment, "BATCH_EPISODES", 2)
 
 
-def no_state(patch: pytest.MonkeyPatch) -> None:
-    small_batches(patch)
-    patch.setattr(augment, "_stated", lambda *given: None)
-
-
 def often(patch: pytest.MonkeyPatch) -> None:
     given: Any = train_tokenizer.__kwdefaults__
     patch.setitem(given, "report_every", 2)
@@ -284,14 +279,15 @@ def often(patch: pytest.MonkeyPatch) -> None:
     patch.setattr("hma_data.tokenizers.training.train.time", no_clock)
 
 
+def no_state(patch: pytest.MonkeyPatch) -> None:
+    small_batches(patch)
+    patch.setattr(augment, "_stated", lambda *given: None)
+
+
 def known_error(patch: pytest.MonkeyPatch) -> None:
     error = labels.LabelError("s", "val", ("a",), (0.1,), (1.0,), (None,), 9)
     patch.setattr(labels, "measure", lambda *given: error)
     patch.setattr(labels, "_check_set", lambda *given: None)
-
-
-def known_judge(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(scores, "train_judge", judge)
 
 
 def blocks(patch: pytest.MonkeyPatch) -> None:
@@ -357,7 +353,7 @@ SLOW = {
     ),
     "policy-eval": Command(
         f"policy-eval {ROBOT} random still --checkpoint {{data}}/rails --episodes 2 --frames 4 --out out",
-        rails, patch=known_judge,
+        rails, patch=lambda patch: patch.setattr(scores, "train_judge", judge),
     ),
     "benchmark": Command("benchmark {data}/rails --quick --out out", rails, patch=tiny_protocol),
     "tokenizer train": Command(TOKENIZER, fsq, WEIGHTS, DONE, patch=often, trusted="w$"),

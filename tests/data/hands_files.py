@@ -101,11 +101,9 @@ def epic_message(number: int, hands: Iterable[tuple[str, float, tuple[float, flo
     return out + _field(4, _field(1, _field(1, 0.5)) + _field(2, 0.9))
 
 
-def epic_messages(length: int, seen: Seen = always, score: float = 0.9) -> list[bytes]:
-    return [
-        epic_message(i + 1, [(side, score, place(side, i)) for side in ("left", "right") if seen(side, i)])
-        for i in range(length)
-    ]
+def epic_messages(length: int) -> list[bytes]:
+    hands = ("left", "right")
+    return [epic_message(i + 1, [(side, 0.9, place(side, i)) for side in hands]) for i in range(length)]
 
 
 # -- Ego4D and Ego-Exo4D
@@ -151,7 +149,7 @@ def ego4d(videos: dict[str, list[dict[str, Any]]]) -> str:
     return json.dumps({"date": "211014", "version": "v2", "videos": items})
 
 
-def egoexo(length: int, take: str = "cook_1", camera: str = "cam01", seen: Seen = always) -> str:
+def egoexo(length: int, camera: str = "cam01") -> str:
     """A take's hand labels: each joint a hundredth of the picture right of the one before."""
     found = {}
     for i in range(length):
@@ -162,10 +160,9 @@ def egoexo(length: int, take: str = "cook_1", camera: str = "cam01", seen: Seen 
                 "placement": "auto",
             }
             for side in ("left", "right")
-            if seen(side, i)
             for number, joint in enumerate(JOINTS)
         }
-        metadata = {"take_uid": "uid-1", "take_name": take, "frame_number": i}
+        metadata = {"take_uid": "uid-1", "take_name": "cook_1", "frame_number": i}
         found[str(i)] = [
             {"metadata": metadata, "annotation2D": {camera: joints, "cam09": {}}, "annotation3D": {}}
         ]

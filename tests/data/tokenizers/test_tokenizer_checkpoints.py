@@ -1,7 +1,6 @@
 """Weights of downloaded tokenizers: where they are found, and what is refused before it can do harm."""
 
 import json
-import os
 import pickle
 from pathlib import Path
 
@@ -17,23 +16,16 @@ from hma_data.tokenizers.base import get_tokenizer
 from hma_data.tokenizers.catalog import CATALOG
 from hma_data.tokenizers.checkpoints import digest_of, find_weights, read_tensors, stated_scale
 from tests.data.tokenizer_files import frames, magvit2_state, write_magvit2, write_tiny_pair, write_tiny_whole
+from tests.hostile import Touch
 
 # -- files that mean harm or are damaged
-
-
-class Evil:
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self):
-        return os.system, (f"touch '{self.path}'",)
 
 
 @pytest.mark.parametrize("zipped", [True, False], ids=["zip", "legacy"])
 @pytest.mark.parametrize("name", ["magvit2", "taesd"])
 def test_a_hostile_checkpoint_is_refused_and_does_not_run(tmp_path, name, zipped):
     mark, path = tmp_path / "ran", tmp_path / "evil.ckpt"
-    state = {"state_dict": magvit2_state(), "hyper_parameters": Evil(mark)}
+    state = {"state_dict": magvit2_state(), "hyper_parameters": Touch(mark)}
     torch.save(state, path, _use_new_zipfile_serialization=zipped)
     with pytest.raises(TokenizerError, match=r"evil\.ckpt: .*holds more than tensors"):
         get_tokenizer(name, weights=str(path))
@@ -42,7 +34,7 @@ def test_a_hostile_checkpoint_is_refused_and_does_not_run(tmp_path, name, zipped
 
 def test_a_bare_hostile_pickle_does_not_run(tmp_path):
     mark, path = tmp_path / "ran", tmp_path / "evil.pt"
-    path.write_bytes(pickle.dumps(Evil(mark)))
+    path.write_bytes(pickle.dumps(Touch(mark)))
     with pytest.raises(TokenizerError, match=r"evil\.pt"):
         read_tensors(path)
     assert not mark.exists()

@@ -30,7 +30,6 @@ from tests.model.robots import edit_card, make_model, save
 from tests.model.shards import make_shards
 
 pytest_plugins = ["tests.hub_fixtures"]
-REPO = "team/model"
 
 
 def test_the_hubs_filters_find_a_model_by_its_data_and_its_base(tmp_path: Path) -> None:

@@ -23,8 +23,6 @@ from tests.hub_server import connect, serve
 from tests.model.robots import Blocks, make_model, save
 from tests.model.shards import make_shards
 
-ROBOTS = {"arm": 2, "hand": 3}
-
 
 @pytest.fixture
 def painted(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -31,6 +31,7 @@ from recipes.public import dino_wm, gpc, iws, sets
 from recipes.public.sets import BASELINE, checked_file, gaussian_ssim
 from recipes.public.worldarena import export
 from recipes.public.zarr2 import ZarrArray, unblosc
+from tests.hostile import Touch
 from tests.model.public import look_alikes
 from tests.model.public.look_alikes import write_zarr
 from tests.model.true_world import _of_robot
@@ -115,16 +116,9 @@ def test_a_window_has_the_actions_between_its_frames(tmp_path) -> None:
     assert window.given.shape == (1, 64, 64, 3)
 
 
-class Trap:
-    """What runs code when it is unpickled."""
-
-    def __reduce__(self):
-        return Path.touch, (Path("trapped"),)
-
-
 def test_no_code_of_a_published_file_runs(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    torch.save(Trap(), "states.pth")
+    torch.save(Touch("trapped"), "states.pth")
     with pytest.raises(SourceError, match=r"states\.pth: is no tensor"):
         dino_wm.tensor(Path("states.pth"))
     assert not Path("trapped").exists()

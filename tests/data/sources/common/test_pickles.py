@@ -1,6 +1,5 @@
 """Dictionaries that numpy stored: equal to numpy's own reading, and nothing of the file runs."""
 
-import os
 import pickle
 from contextlib import suppress
 from pathlib import Path
@@ -13,7 +12,7 @@ from hypothesis.extra import numpy as arrays
 
 from hma_data.errors import EpisodeError
 from hma_data.sources.common.pickles import read_dict
-from tests.hostile import Edit, Row, untouched
+from tests.hostile import Edit, Row, Touch, untouched
 
 
 def write(path: Path, value: object, protocol: int) -> Path:
@@ -64,17 +63,9 @@ def test_shared_values_and_fortran_order_are_read(tmp_path):
         assert equal(read_dict(write(tmp_path / "x.npy", value, protocol)), value)
 
 
-class Evil:
-    def __reduce__(self):
-        return (os.system, (f"touch {self.path}",))
-
-    def __init__(self, path):
-        self.path = path
-
-
 @pytest.mark.parametrize("protocol", range(6))
 def test_code_in_a_file_is_refused_and_does_not_run(protocol, tmp_path):
-    path = write(tmp_path / "x.npy", {"a": Evil(tmp_path / "ran")}, protocol)
+    path = write(tmp_path / "x.npy", {"a": Touch(tmp_path / "ran")}, protocol)
     with pytest.raises(EpisodeError, match=r"posix\.system|nt\.system"):
         read_dict(path)
     assert not (tmp_path / "ran").exists()

@@ -12,7 +12,7 @@ from hma_data.errors import EpisodeError, RegistryError, SourceError
 from hma_data.sources.base import open_source
 from tests.data import hands_files as made
 from tests.data.videos import HEIGHT, WIDTH
-from tests.hostile import Edit, Row, check_refused, cut, of, untouched, whole
+from tests.hostile import Edit, Row, Touch, check_refused, cut, of, untouched, whole
 
 LENGTH, NAMES = 30, ("a", "b", "c")
 EPIC, EGO4D, EXO = "epic_kitchens_hand_objects", "ego4d_fho", "egoexo4d_hand_pose"
@@ -33,11 +33,6 @@ def test_a_wrong_layout_says_where_and_what_is_allowed(layout: dict[str, Any], f
     key = next(iter(layout))
     with pytest.raises(RegistryError, match=rf"source\.layout\.{key}: .*{fault}"):
         made.hand_video("landmarks", **layout)
-
-
-class Touch:
-    def __reduce__(self):
-        return Path.touch, (Path("ran"),)
 
 
 def write_labels(folder: Path, labels: str, names: Sequence[str] = NAMES, table: str = "hands.csv") -> None:
@@ -76,17 +71,12 @@ def moved(name: str, content: str) -> Edit:
     return lambda folder: (folder / "hands.csv").rename(folder / name).write_text(content)
 
 
-def without_videos(folder: Path) -> None:
-    for path in folder.glob("*.mp4"):
-        path.unlink()
-
-
 def of_format(labels: str, **more: Any) -> dict[str, Any]:
     return {"labels": labels, **more}
 
 
 TAKE = of_format(EXO, part="wrist", camera="a")
-CODE = pickle.dumps([*made.epic_messages(3), Touch()])
+CODE = pickle.dumps([*made.epic_messages(3), Touch("ran")])
 HEAD, POSE = "video,frame,side,x,y\n", "is not Ego-Exo4D's hand pose"
 NO_INTERVAL = '{"videos": [{"video_uid": "a", "annotated_intervals": []}]}'
 POINT = '{"1": [{"annotation2D": {"a": {"left_wrist": {"x": 1}}}}]}'
@@ -133,7 +123,7 @@ ALL: dict[str, Row] = {  # no video can be used
     "Ego-Exo4D: none": (untouched, "holds no labels", of_format(EXO)),
     "another rate": (untouched, "labelled at 10 Hz, embodiment test_hands says frequency_hz 30", {"hz": 30}),
     "no such part": (untouched, "no label has left/wrist — labels have left/center", {"part": "wrist"}),
-    "no videos": (without_videos, "holds no videos"),
+    "no videos": (lambda folder: [path.unlink() for path in folder.glob("*.mp4")], "holds no videos"),
 }
 
 
