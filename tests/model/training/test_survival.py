@@ -2,6 +2,7 @@
 
 import errno
 import json
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,16 +10,19 @@ import numpy as np
 import pytest
 import torch
 
-from hma_data.errors import CheckpointError, OutputError, RecipeError, ShardError, TrainingError
+from hma_data.errors import CheckpointError, OutputError, RecipeError, ShardError, TrainingError, UsageError
 from hma_data.shards.writer import ShardWriter
+from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.checkpoint import io as checkpoint
-from hma_model.checkpoint.folder import resolve, training_checkpoints
+from hma_model.checkpoint.folder import read_metadata, resolve, training_checkpoints
+from hma_model.checkpoint.weights import read_tensors, write_tensors
 from hma_model.training.guards import StepMetrics
 from hma_model.training.logging import read_metrics
 from hma_model.training.loop import train
 from hma_model.training.parallel import Ranks
 from hma_model.training.recipe import make_recipe
 from tests.model.processes import errors
+from tests.model.robots import SPEC
 from tests.model.runs import TINY, same, train_until
 from tests.model.shards import make_shards
 from tests.model.training.test_parallel import spread
@@ -91,9 +95,6 @@ def test_the_folder_of_another_run_is_refused_with_what_differs(recipe, data, tm
 
 
 def test_shards_of_two_tokenizers_are_refused_with_both_names(recipe, data, tmp_path):
-    from hma_data.tokenizers.base import TokenizerSpec
-    from tests.model.robots import SPEC
-
     spec = TokenizerSpec(**{**SPEC.to_json(), "name": "coded"})
     other = make_shards(tmp_path / "hand", "hand", spec=spec)
     with pytest.raises(ShardError, match="tokenized by coded .* by raw"):
@@ -211,3 +212,122 @@ def test_losses_of_several_objectives_are_kept_apart():
     loss, by_embodiment, by_objective = metrics.whole(Ranks(), 3)
     assert loss == pytest.approx((4 + 0.5 + 0.25) / 3)
     assert by_embodiment == {"arm": 4} and by_objective == {"forward": 4, "policy": 0.375}
+
+
+# -- what a run goes on from
+
+
+@pytest.fixture(scope="module")
+def averaged(tmp_path_factory):
+    data = [str(make_shards(tmp_path_factory.mktemp("shards") / "arm", "arm"))]
+
+    def averaged(**changes):
+        return make_recipe({**TINY, "data": data, "ema": 0.5, **changes})
+
+    return averaged
+
+
+@pytest.fixture(scope="module")
+def whole(averaged, tmp_path_factory):
+    return train(averaged(), out=tmp_path_factory.mktemp("whole") / "run", show=False).out
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "config.json", "trunk.safetensors", "embodiments/arm/stem.safetensors", "embodiments/arm/stats.json",
+        "training/state.json", "training/optimizer.safetensors",
+        "training/weights.safetensors",
+    ],
+)  # fmt: skip
+def test_a_flipped_bit_is_found_wherever_it_is(averaged, tmp_path, capsys, name, whole):
+    run = shutil.copytree(whole, tmp_path / "run")
+    path = run / "checkpoints/step-00000006" / name
+    content = bytearray(path.read_bytes())
+    place = content.rindex(b"1") if path.suffix == ".json" else len(content) - 3
+    content[place] ^= 1
+    path.write_bytes(content)
+    assert same(whole / "checkpoints/step-00000006", train(averaged(), out=run).checkpoint)
+    assert f"skipped a damaged checkpoint: {run}/checkpoints/step-00000006" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("file", "key"), [("config.json", "format_version"), ("training/state.json", "version")]
+)
+def test_a_newer_releases_checkpoint_is_not_passed_over(averaged, tmp_path, whole, file, key):
+    run = shutil.copytree(whole, tmp_path / "run")
+    path = run / "checkpoints/step-00000006" / file
+    path.write_text(json.dumps({**json.loads(path.read_text()), key: 7}))
+    with pytest.raises(CheckpointError, match=rf"is of {key} 7, this release resumes from 1 .*start="):
+        train(averaged(), out=run, show=False)
+    assert (run / "checkpoints/step-00000006").is_dir()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"model": {**TINY["model"], "width": 32}}, "another network: width is 32, it was 16"),
+        ({"model": {**TINY["model"], "qk_norm": True}}, "another network: qk_norm is True, it was False"),
+    ],
+)
+def test_not_even_force_goes_on_with_another_network(averaged, whole, changes, message):
+    with pytest.raises(RecipeError, match=message):
+        train(averaged(**changes, steps=8), out=whole, show=False, force=True)
+
+
+def test_not_even_force_goes_on_with_another_tokenizer(averaged, whole, tmp_path):
+    spec = TokenizerSpec(**{**SPEC.to_json(), "name": "other"})
+    shards = make_shards(tmp_path / "arm", "arm", spec=spec)
+    with pytest.raises(RecipeError, match="another tokenizer: 'raw', now 'other'"):
+        train(averaged(data=[str(shards)], steps=8), out=whole, show=False, force=True)
+
+
+def test_robots_that_force_leaves_behind_are_named(averaged, whole, tmp_path, capsys):
+    run, hand = shutil.copytree(whole, tmp_path / "run"), make_shards(tmp_path / "hand", "hand", dims=3)
+    train(averaged(data=[str(hand)], steps=7), out=run, force=True)
+    assert "the next checkpoints leave out: arm" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("out", [None, "", " "])
+def test_what_cannot_be_a_folder_is_wrong_usage(averaged, out):
+    with pytest.raises(UsageError, match="out: is not given"):
+        train(averaged(), out=out, show=False)
+
+
+def test_every_line_of_progress_is_said_once(averaged, tmp_path, capsys):
+    train(averaged(), out=tmp_path / "run")
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == len(set(lines)) and lines[-2].startswith("windows: ")
+    assert lines[-1].startswith("training: 6/6 steps") and "loss arm" in lines[-1]
+    assert lines[-3].startswith("step 6: loss arm") and "validation" in lines[-3]
+    assert "\x1b" not in "".join(lines)
+
+
+def test_a_resumed_run_says_where_it_continues(averaged, tmp_path, capsys):
+    train_until(averaged(), tmp_path / "run", 5)
+    for said in (["continues after step 4"], []):  # and a finished one says nothing of it
+        train(averaged(), out=tmp_path / "run")
+        assert [line for line in capsys.readouterr().err.splitlines() if line.startswith("continues")] == said
+
+
+def test_a_line_of_metrics_that_is_damaged_is_left_out(averaged, whole, tmp_path):
+    run = shutil.copytree(whole, tmp_path / "run")
+    lines = (run / "metrics.jsonl").read_bytes().splitlines(keepends=True)
+    (run / "metrics.jsonl").write_bytes(
+        b"".join([*lines[:2], b"\xff\n", b"[1]\n", b'{"step": "x"}\n', *lines[2:]])
+    )
+    assert train(averaged(), out=run, show=False).losses == [
+        (line["step"], line["loss"]) for line in map(json.loads, lines) if line["kind"] == "train"
+    ]
+
+
+def test_the_same_tensors_give_the_same_bytes(tmp_path):
+    metadata = {f"key{i}": f'val"ue {i}' for i in range(8)}
+    tensors = {"b": torch.arange(3.0), "a.é": torch.ones(2, 2, dtype=torch.bfloat16)}
+    contents = set()
+    for i in range(8):
+        write_tensors(tmp_path / f"{i}.safetensors", tensors, metadata)
+        contents.add((tmp_path / f"{i}.safetensors").read_bytes())
+    assert len(contents) == 1 and read_metadata(tmp_path / "0.safetensors") == metadata
+    read = read_tensors(tmp_path / "0.safetensors")
+    assert all(torch.equal(value, tensors[name]) for name, value in read.items())
