@@ -35,7 +35,8 @@ def test_a_demo_that_was_cut_goes_on_by_the_same_command(tmp_path, monkeypatch) 
     kept = {
         path: path.stat().st_mtime_ns
         for name in ("recordings", "shards", "run/checkpoints")
-        for path in _files(out / name)
+        for path in (out / name).rglob("*")
+        if path.is_file() and not path.name.startswith(".")
     }
     assert not (out / "report.html").exists()
 
@@ -137,7 +138,3 @@ def film() -> RolloutVideo:
     images[1:3, 1:3] = True
     frames[:, images] = 90
     return RolloutVideo(frames, 10.0, 2, np.zeros((1, 2, 2), np.float32), images)
-
-
-def _files(folder: Path) -> list[Path]:
-    return [path for path in folder.rglob("*") if path.is_file() and not path.name.startswith(".")]

@@ -50,10 +50,6 @@ def target(request, tmp_path: Path):
         fsspec.filesystem("memory").store.clear()
 
 
-def published(target) -> list[str]:
-    return [row["embodiment"] for row in list_embodiments(target)]
-
-
 def other_robot(source: Path, out: Path, name: str, dims: int, seed: int) -> Path:
     model = checkpoint.load(source, [])
     torch.manual_seed(seed)
@@ -71,13 +67,12 @@ def other_robot(source: Path, out: Path, name: str, dims: int, seed: int) -> Pat
         ("name", False),
     ],
 )  # fmt: skip
-def test_which_addresses_are_repositories(address, repository):
-    assert hub.is_repository(address) is repository
-
-
-def test_a_folder_that_is_there_is_no_repository(tmp_path, monkeypatch):
-    (tmp_path / "org/name").mkdir(parents=True)
+def test_which_addresses_are_repositories_and_a_folder_that_is_there_is_none(
+    address, repository, tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
+    assert hub.is_repository(address) is repository
+    (tmp_path / "org/name").mkdir(parents=True)
     assert not hub.is_repository("org/name")
 
 
@@ -179,7 +174,7 @@ def test_links_in_circles_are_not_followed(source, tmp_path):
     hub.push(source, tmp_path / "hub", ["arm"])
     for name in ("one", "two", "three"):
         (tmp_path / "hub/embodiments" / name).symlink_to(tmp_path / "hub")
-    assert published(tmp_path / "hub") == ["arm"]
+    assert [row["embodiment"] for row in list_embodiments(tmp_path / "hub")] == ["arm"]
     hub.push(source, tmp_path / "hub", ["hand"])
     assert sorted(HMA.from_pretrained(str(tmp_path / "hub")).embodiments) == ["arm", "hand"]
 
@@ -253,8 +248,7 @@ class FileStore(LocalFileSystem):
 
 
 @pytest.fixture(autouse=True)
-def stores(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
-    monkeypatch.setenv("HMA_CACHE", str(tmp_path / "cache"))
+def stores() -> Iterator[None]:
     fsspec.register_implementation("filestore", FileStore, clobber=True)
     yield
     FileStore.clear_instance_cache()

@@ -1,7 +1,7 @@
 """Hubs that differ, that are hostile, or that fail in the middle: the client's side of it."""
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -159,12 +159,7 @@ def test_a_file_that_grows_beyond_its_size_is_not_kept(published, tmp_path):
     assert all(path.stat().st_size <= len(trunk) for path in tmp_path.rglob("*") if path.is_file())
 
 
-def sizes(folder: Path, names: Iterable[str]) -> dict[str, int]:
-    return {name: (folder / name).stat().st_size for name in names}
-
-
 ARM = ("config.json", "trunk.safetensors", *(f"embodiments/arm/{part}" for part in PARTS))
-STEM = "embodiments/arm/stem.safetensors"
 
 
 def test_pulls_at_once_fetch_every_byte_once(published, source):
@@ -174,7 +169,7 @@ def test_pulls_at_once_fetch_every_byte_once(published, source):
         published.await_count("HEAD .*trunk", 3)
         published.stalled.set()
         folders = {pull.result(60) for pull in pulls}
-    assert len(folders) == 1 and published.sent() == sizes(source, ARM)
+    assert len(folders) == 1 and published.sent() == {name: (source / name).stat().st_size for name in ARM}
 
 
 @pytest.mark.parametrize("sha", ["../../escaped", "..", "a/b", "main", ""])

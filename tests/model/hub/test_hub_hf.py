@@ -6,7 +6,6 @@ import os
 import resource
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -21,15 +20,12 @@ from hma_model.cli import app
 from hma_model.hub import publish as hub
 from hma_model.hub.listing import list_embodiments, survey
 from hma_model.network.model import HMA
+from tests.command import ROOT
+from tests.conftest import contents
 from tests.hub_state import REPO, ROBOTS, TOKEN
 from tests.model.robots import edit_card, save
 
 pytest_plugins = ["tests.hub_fixtures"]
-ROOT = Path(__file__).resolve().parents[3]
-
-
-def files_of(folder: Path) -> set[str]:
-    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
 
 
 def test_one_embodiment_is_one_commit_that_touches_its_folder_and_the_card_only(server, source):
@@ -134,9 +130,7 @@ def test_a_revision_is_the_one_named(published, source, tmp_path):
     repository = published.model(REPO)
     repository.refs["v1"] = repository.commits[-1].id
     save(tmp_path / "other", {"leg": 4}, seed=3)
-    repository.commit(
-        {name: (tmp_path / "other" / name).read_bytes() for name in files_of(tmp_path / "other")}
-    )
+    repository.commit(contents(tmp_path / "other"))
     theirs = checkpoint.load(source, ["arm"]).state_dict()
     commit = repository.refs["v1"]
     for address, revision in (

@@ -501,8 +501,10 @@ def test_a_robot_without_a_simulator_or_with_several_cameras_is_refused(world: W
     from hma_model.cli import app
     from tests.model.robots import make_model
 
+    other = object.__new__(World)
+    other.model, other._specs = make_model({"arm": 2}), {}
     with pytest.raises(HMAError, match="arm: has no simulator to compare"):
-        Scenes.of(_world_of(make_model({"arm": 2})), "arm", 1, 0)
+        Scenes.of(other, "arm", 1, 0)
     monkeypatch.setattr(world.model, "config", world.model.config.replace(views=2))
     with pytest.raises(UsageError, match="rails_03: the simulator shows one camera, and the model sees 2"):
         evaluate_policies(ROBOT, ["still"], world=world)
@@ -515,12 +517,6 @@ def test_a_file_in_place_of_the_folder_is_refused_before_the_work(tmp_path: Path
     (tmp_path / "a file").write_text("")
     ran = CliRunner().invoke(app, ["policy-eval", ROBOT, "still", "--out", str(tmp_path / "a file")])
     assert isinstance(ran.exception, OutputError) and "a file: cannot be written: " in str(ran.exception)
-
-
-def _world_of(model: HMA) -> World:
-    made = object.__new__(World)
-    made.model, made._specs = model, {}
-    return made
 
 
 @pytest.mark.slow

@@ -65,14 +65,10 @@ class Oracle:
         return (true + self.share * true.std() * self.rng.normal(size=true.shape)).astype(np.float32)
 
 
-def oracle(world: World, real: Path, share: float) -> Oracle:
-    shards = ShardSet(real)
-    return Oracle(ShardFilm(world, shards, shards.row_stride), share)
-
-
 @pytest.mark.slow
 def test_labelled_shards_verify_and_say_what_they_are(world, real, tmp_path, monkeypatch) -> None:
-    knows = oracle(world, real, 0.5)
+    shards = ShardSet(real)
+    knows = Oracle(ShardFilm(world, shards, shards.row_stride), 0.5)
     monkeypatch.setattr(labels, "infer", knows)
     out = tmp_path / "a folder"
     found = label_actions(real, out, ROBOT, checkpoint="", check=real, world=world)
