@@ -17,7 +17,11 @@ OMP_NUM_THREADS=1 python "$here/recipes/world/record.py" "$out" --episodes "${EP
     --workers "${WORKERS:-2}" --tokenizer palette-64 --robots $robots
 # shellcheck disable=SC2086
 data=$(printf "$out/shards/%s," $robots)
-OMP_NUM_THREADS=1 torchrun --nproc-per-node "${PROCESSES:-2}" --no-python \
-    hma train world_unet "data=[${data%,}]" "$@" --out "$out/run"
+train() {
+    OMP_NUM_THREADS=1 torchrun --nproc-per-node "${PROCESSES:-2}" --no-python \
+        hma train "$1" "data=[${data%,}]" "${@:2}"
+}
+train world_unet "$@" --out "$out/squares"
+train world_whole "$@" "start=$out/squares" --out "$out/run"
 hma bench holds checkpoint="$out/run" robots=arm3_04,mover_10,planar_arm frames=300 sheet="$out/holds.png" |
     tee "$out/holds.txt"

@@ -16,11 +16,9 @@ recording=$out/contact/pusht_fast.hdf5
 hma convert "$recording" -e pusht_fast --tokenizer palette-64 --weights "$out/colors.safetensors" \
     --frames strided --val-fraction 0.02 --out "$out/shards"
 train() {
-    OMP_NUM_THREADS=1 torchrun --nproc-per-node "${PROCESSES:-2}" --no-python hma train world_pusht "data=$out/shards" "$@"
+    OMP_NUM_THREADS=1 torchrun --nproc-per-node "${PROCESSES:-2}" --no-python hma train "$1" "data=$out/shards" "${@:2}"
 }
-train "$@" --out "$out/squares"
-# On whole frames in the end: squares show too little of where a pushed T goes.
-train lr=8e-4 muon_lr=0.01 cpu_seconds=2000 "$@" "start=$out/squares" model.crop=0 warmup=20 self_forward_from=0 \
-    ema=0.995 --out "$out/run"
+train world_pusht "$@" --out "$out/squares"
+train world_whole "$@" "start=$out/squares" --out "$out/run"
 hma bench holds checkpoint="$out/run" robots=pusht_fast driver=contact frames=45 prompt=5 seed=5012 rollouts=48 \
     sheet="$out/holds.png" | tee "$out/holds.txt"

@@ -257,6 +257,7 @@ TOKENIZERS = {
     "world_arm": "palette-64",
     "world_pusht": "palette-64",
     "world_unet": "palette-64",
+    "world_whole": "palette-64",
 }
 
 
