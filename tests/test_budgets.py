@@ -45,8 +45,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/worlds": (1_542, 11_886, 6),
 }
 PRODUCT_LINES, PRODUCT_NODES = 65_658, 520_395
-TEST_LINES = 48_282
-DOC_WORDS = 41_770
+TEST_LINES = 48_283
+DOC_WORDS = 42_030
 
 
 @cache
