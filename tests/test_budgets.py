@@ -46,7 +46,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
 }
 PRODUCT_LINES, PRODUCT_NODES = 65_658, 520_395
 TEST_LINES = 48_283
-DOC_WORDS = 42_030
+DOC_WORDS = 41_997
 
 
 @cache
