@@ -110,10 +110,10 @@ def test_its_true_and_false_positives_are_those_of_the_held_out_episodes(world, 
 
 
 def test_held_out_episodes_of_one_recording_count_as_one(world, shards, judge) -> None:
-    state(shards, "group", last=[f"r{number // 4}" for number in range(HELD_OUT)])
+    state(shards, "group", last=[f"r{number // 6}" for number in range(HELD_OUT)])
     with pytest.raises(HMAError, match=f"with {NEEDED} or more of each, of different recordings"):
         measured_judge(str(judge), world, ROBOT, ShardSet(shards))
-    state(shards, "group", last=[f"r{number // 2 % 6}" for number in range(HELD_OUT)])
+    state(shards, "group", last=[f"r{(number + 2) // 3}" for number in range(HELD_OUT)])
     found = measured_judge(str(judge), world, ROBOT, ShardSet(shards))
     assert (found.hits, found.alarms, found.held_out.count) == (7, 1, 16)
     assert found.hits_95[0] < 0.45 and found.alarms_95[1] > 0.55  # of eight recordings 0.47 and 0.53
