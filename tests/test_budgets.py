@@ -29,7 +29,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model": (569, 3_464, 4),
     "hma_model/benchmark": (823, 7_070, 5),
     "hma_model/checkpoint": (945, 7_275, 5),
-    "hma_model/cli": (1_759, 11_368, 12),
+    "hma_model/cli": (1_771, 11_481, 12),
     "hma_model/demo": (476, 4_001, 4),
     "hma_model/evaluation": (4_500, 35_827, 24),
     "hma_model/export": (1_169, 9_247, 9),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_693, 30_223, 20),
     "hma_model/worlds": (1_542, 11_886, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_658, 520_395
-TEST_LINES = 48_283
+PRODUCT_LINES, PRODUCT_NODES = 65_670, 520_508
+TEST_LINES = 48_294
 DOC_WORDS = 41_997
 
 

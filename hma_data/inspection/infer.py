@@ -138,6 +138,16 @@ def proposal(found: Inspection) -> tuple[str, dict[str, float], dict[str, Offset
     return "", {one.name: one.held_s for one in topics if one.held_s is not None}, draft.offsets
 
 
+def target_hz(hz: float | None, lengths: Sequence[int]) -> float | int:
+    """Return the rate for a model: the paper's, or as much more as episodes of few frames at `hz` need."""
+    if not hz or not lengths:
+        return TARGET_HZ
+    slowest = max(1, math.floor(hz / TARGET_HZ + 0.5))
+    stride = max(1, min(slowest, int(statistics.median(lengths) // FRAMES_PER_EPISODE)))
+    rate = round(hz / stride, 3)
+    return TARGET_HZ if stride == slowest else int(rate) if rate == int(rate) else rate
+
+
 def _in_registry(found: Inspection, values: dict[str, Any]) -> str:
     """Return one line that names the embodiments which may be this robot; empty where there are none.
 
@@ -237,7 +247,7 @@ class _Draft:
             "robot": found.robot or f"{TODO}: which robot is it?",
             "kind": "simulation" if facts.get("simulator") else f"{TODO}: real, simulation or human?",
             "frequency_hz": self._rate() or f"{TODO}: at how many Hz were actions recorded?",
-            "target_hz": self._target(),
+            "target_hz": target_hz(self._rate(), found.lengths),
             **({"stride": 1} if self._short_at_any_rate() else {}),
             "action": {
                 "space": f"{TODO}: one of {', '.join(spaces[:-1])} or {spaces[-1]}?",
@@ -274,16 +284,6 @@ class _Draft:
         whole = round(self.hz)
         tolerance = RATE_TOLERANCE + (min(doubt, 0.02) if doubt == doubt else 0.0)
         return whole if whole and abs(self.hz / whole - 1) < tolerance else round(self.hz, 3) or None
-
-    def _target(self) -> float | int:
-        """Return the rate for the model: the paper's, or as much more as short episodes need."""
-        hz, lengths = self._rate(), self.found.lengths
-        if not hz or not lengths:
-            return TARGET_HZ
-        length, slowest = statistics.median(lengths), max(1, math.floor(hz / TARGET_HZ + 0.5))
-        stride = max(1, min(slowest, int(length // FRAMES_PER_EPISODE)))
-        rate = round(hz / stride, 3)
-        return TARGET_HZ if stride == slowest else int(rate) if rate == int(rate) else rate
 
     def _short_at_any_rate(self) -> bool:
         """Check whether nobody knows the rate yet, and episodes are so short that every frame is needed."""
@@ -344,7 +344,7 @@ class _Draft:
 
     def _provenance(self) -> dict[str, str]:
         said = {"frequency_hz": self._rate_from() if self.hz else f"{TODO}: where is the rate stated?"}
-        if self._target() != TARGET_HZ or self._short_at_any_rate():
+        if target_hz(self._rate(), self.found.lengths) != TARGET_HZ or self._short_at_any_rate():
             length = f"{statistics.median(self.found.lengths):g} steps"
             said["stride" if self._short_at_any_rate() else "target_hz"] = (
                 f"so that a model sees {FRAMES_PER_EPISODE} frames of an episode of {length}, if it has them"

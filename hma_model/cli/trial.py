@@ -5,6 +5,7 @@ so the same command continues.
 """
 
 import json
+import math
 import re
 import shlex
 import subprocess
@@ -70,7 +71,7 @@ def try_recording(
         yaml = folder / "robot.yaml"
         step("inspect", data, "--fail-on", "never")
         step("registry", "infer", data, "--id", name, "--out", yaml, there=yaml.is_file())
-        _answer(yaml, answer or [])
+        _answer(data, yaml, answer or [])
         embodiment = str(yaml)
     chosen = [word for name in only or () for word in ("--only", name)]
     tokenizer = _tokenizer(data, embodiment)
@@ -131,14 +132,22 @@ def _shown_split(folder: Path) -> tuple[str, int]:
     return split, max(1, min(LONGEST_FILM, longest))
 
 
-def _answer(path: Path, given: list[str]) -> None:
-    """Replace the TODOs of a YAML by the answers that are given, or asked for in a terminal."""
+def _answer(data: str, path: Path, given: list[str]) -> None:
+    """Replace the TODOs of a YAML by the answers that are given, or asked for in a terminal.
+
+    A rate that the recording did not state decides which of its frames the model is to see.
+    """
+    from hma_data.inspection.infer import target_hz
     from hma_data.registry.embodiment import todos
+    from hma_data.sources.base import open_source
+    from hma_data.sources.detect import detect
     from hma_data.storage.files import write_atomic
     from hma_data.storage.yaml_io import parse_yaml, read_yaml, write_yaml
 
     values = read_yaml(path)
-    for key, text in pairs("--answer", given, "kind=real").items():
+    is_rate_open = "frequency_hz" in dict(todos(values))
+    answers = pairs("--answer", given, "kind=real")
+    for key, text in answers.items():
         _set(values, key, parse_yaml(text, f"{key}={text}", UsageError))
     open_questions = []
     for key, question in todos(values):
@@ -156,6 +165,9 @@ def _answer(path: Path, given: list[str]) -> None:
         asked = "; ".join(f"{key}: {question}" for key, question in open_questions)
         flags = " ".join(f"--answer {key}=…" for key, _ in open_questions)
         raise RegistryError(path, f"has open questions: {asked}", f"use {flags}, or edit the file")
+    rate = values["frequency_hz"] if is_rate_open and not {"stride", "target_hz"} & {*answers} else None
+    if isinstance(rate, int | float) and 0 < rate < math.inf and "stride" not in values:
+        values["target_hz"] = target_hz(rate, open_source(detect(data)).inspect(data).lengths)
     write_atomic(path, write_yaml(values))
 
 

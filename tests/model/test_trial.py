@@ -66,8 +66,19 @@ def test_a_proposed_crop_is_asked_about_in_a_terminal(said, cropped, tmp_path, m
     path.write_text(write_yaml({"cameras": [camera], "provenance": {"crop": "TODO: does it hold all?"}}))
     monkeypatch.setattr("sys.stdin.isatty", lambda: True)
     monkeypatch.setattr("builtins.input", lambda question: said)
-    trial._answer(path, [])
+    trial._answer("unread", path, [])
     assert ("crop" in read_yaml(path)["cameras"][0]) is cropped
+
+
+def test_a_rate_that_is_answered_decides_what_the_model_sees(tmp_path: Path) -> None:
+    recording, path = recorded(tmp_path, 2), tmp_path / "robot.yaml"  # of 80 actions each
+    for given, seen in (("24", 8), ("6", 2), (".inf", 2)):
+        path.write_text(write_yaml({"frequency_hz": "TODO: at how many Hz?", "target_hz": 2}))
+        trial._answer(str(recording), path, [f"frequency_hz={given}"])
+        assert read_yaml(path)["target_hz"] == seen
+    path.write_text(write_yaml({"frequency_hz": "TODO: at how many Hz?", "target_hz": 2}))
+    trial._answer(str(recording), path, ["frequency_hz=24", "target_hz=4"])
+    assert read_yaml(path)["target_hz"] == 4
 
 
 def test_of_a_single_episode_the_training_is_shown(tmp_path, monkeypatch) -> None:
