@@ -18,7 +18,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/conversion": (4_140, 30_705, 15),
     "hma_data/episodes": (1_713, 15_007, 9),
     "hma_data/hub": (517, 3_857, 3),
-    "hma_data/inspection": (2_109, 19_936, 8),
+    "hma_data/inspection": (2_110, 19_963, 8),
     "hma_data/lab": (3_304, 30_340, 16),
     "hma_data/loading": (1_283, 10_898, 6),
     "hma_data/registry": (1_274, 8_232, 6),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_693, 30_223, 20),
     "hma_model/worlds": (1_542, 11_886, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_670, 520_508
-TEST_LINES = 48_294
+PRODUCT_LINES, PRODUCT_NODES = 65_671, 520_535
+TEST_LINES = 48_286
 DOC_WORDS = 41_997
 
 

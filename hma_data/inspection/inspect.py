@@ -106,9 +106,9 @@ def inspect_recording(
     elif robot:
         report["embodiment"] = _fit(uri, robot, source, inspection, found)
     else:
-        offsets = proposal(inspection)[2]
+        lack, held, offsets = proposal(inspection)
         report["facts"] |= {f"actions {name}": offset.measured for name, offset in offsets.items()}
-        found += unanswered(inspection)
+        found += unanswered(inspection, lack, held, offsets)
     report["findings"] = [finding.to_json() for finding in found]
     report["problems"] = [str(finding) for finding in found if finding.severity != "info"]
     report["checks"] = _results(inspection.checks, found)
@@ -189,9 +189,10 @@ def _constant(deviations: NDArray[Any], robot: Embodiment) -> list[str]:
     return list(dict.fromkeys(names[i % len(names)] for i in np.flatnonzero(deviations == 0)))
 
 
-def unanswered(inspection: Inspection) -> Iterator[Finding]:
-    """Yield what the YAML of a robot needs and the recording does not have."""
-    lack, held, offsets = proposal(inspection)
+def unanswered(
+    inspection: Inspection, lack: str, held: dict[str, float], offsets: dict[str, Offset]
+) -> Iterator[Finding]:
+    """Yield what the YAML of a robot needs and the recording does not have; the rest is as of `proposal`."""
     if lack:
         said = f"the recording {lack}"
         yield Finding(
@@ -302,7 +303,7 @@ def _recording(uri: str, robot: Embodiment | None, sample: int) -> Iterator[Find
         yield NO_EPISODES
     elif robot is None:
         yield from _without_robot(inspection)
-        yield from unanswered(inspection)
+        yield from unanswered(inspection, *proposal(inspection))
     else:
         yield from _for_robot(inspection, robot)
         yield from _episodes(uri, robot, source, sample, inspection)

@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hma_data.registry.embodiment import Embodiment
-from tests.data.videos import HEIGHT, WIDTH
+from tests.data.videos import HEIGHT, WIDTH, encode
 
 JOINTS = ["wrist"] + [f"{f}_{i}" for f in ("thumb", "index", "middle", "ring", "pinky") for i in range(1, 5)]
 
@@ -61,6 +61,16 @@ def rows(video: str, length: int, seen: Seen = always) -> list[dict[str, Any]]:
         for side in ("left", "right")
         if seen(side, i)
     ]
+
+
+LENGTH, GONE = 30, range(10, 13)  # frames of `write_gap`, and those without the right hand
+
+
+def write_gap(folder: Path, table: str) -> Path:
+    """Write a video of two hands, of which the right one is gone for some frames, and its table."""
+    encode(folder / "a.mp4", range(LENGTH))
+    write_table(folder / table, rows("a", LENGTH, lambda side, i: side == "left" or i not in GONE))
+    return folder
 
 
 def write_table(path: Path, table: list[dict[str, Any]]) -> Path:

@@ -20,7 +20,6 @@ from hma_model.network.model import HMA
 from hma_model.network.stem import NoiseEmbedding, to_digits
 from tests.conftest import BlockTokenizer
 from tests.data import hands_files as made
-from tests.data.videos import encode
 from tests.model.network_parts import seeded, small_batch, small_config, small_model
 
 
@@ -137,16 +136,10 @@ def test_the_embedding_learns_from_noise_in_the_past(kind):
 # -- shards with marks, through the loader, to every loss
 
 
-LENGTH, GONE = 30, range(10, 13)
-
-
 @pytest.fixture(scope="module")
 def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A video of two hands, one of which is gone for three frames that are masked."""
-    folder = tmp_path_factory.mktemp("hands")
-    encode(folder / "a.mp4", range(LENGTH))
-    rows = made.rows("a", LENGTH, lambda side, i: side == "left" or i not in GONE)
-    made.write_table(folder / "hands.csv", rows)
+    folder = made.write_gap(tmp_path_factory.mktemp("hands"), "hands.csv")
     robot = made.hand_video("landmarks", missing="mask")
     values = robot.to_dict() | {"stride": 2}
     convert(Embodiment.from_values(values, "hands"), str(folder), BlockTokenizer(), folder / "out")

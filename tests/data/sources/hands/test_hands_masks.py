@@ -24,19 +24,13 @@ from hma_data.sources.base import open_source
 from hma_data.sources.common.video_file import VideoFile
 from hma_data.sources.hands.runs import Header, cut_into_runs, labels_from_rows
 from tests.data import hands_files as made
-from tests.data.videos import encode, number_of
-
-LENGTH = 30
-GONE = range(10, 13)  # frames without the right hand
+from tests.data.hands_files import GONE, LENGTH
+from tests.data.videos import number_of
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("videos")
-    encode(folder / "a.mp4", range(LENGTH))
-    rows = made.rows("a", LENGTH, lambda side, i: side == "left" or i not in GONE)
-    made.write_table(folder / "hands.parquet", rows)
-    return folder
+    return made.write_gap(tmp_path_factory.mktemp("videos"), "hands.parquet")
 
 
 def read(folder: Path, robot: Embodiment, name: str = "a.mp4#0") -> Clip:

@@ -298,15 +298,10 @@ ROWS = 12
 
 
 def robot() -> Embodiment:
-    values: dict[str, Any] = {
-        "id": "testbot",
-        "kind": "simulation",
-        "frequency_hz": 20,
-        "action": {"space": "joint_position", "components": [{"key": "actions", "dims": 2}]},
-        "cameras": [{"name": "top", "key": "obs/image"}],
-        "source": {"format": "hdf5"},
-    }
-    return Embodiment.from_values(values, "test")
+    return embodiment(
+        action={"space": "joint_position", "components": [{"key": "actions", "dims": 2}]},
+        cameras=[{"name": "top", "key": "obs/image"}],
+    )
 
 
 def counted(group: h5py.Group, first: int, actions: int = ROWS, images: int = ROWS) -> None:
