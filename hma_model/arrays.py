@@ -1,13 +1,12 @@
 """Name the arrays that several packages take and give; choose evenly spaced items."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Float32s = NDArray[np.float32]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
-Images = NDArray[np.uint8]  # one or many, (…, H, W, 3) RGB
+from hma_data.arrays import Bools as Bools
+from hma_data.arrays import Float32s as Float32s
+from hma_data.arrays import Floats as Floats
+from hma_data.arrays import Images as Images
+from hma_data.arrays import Ints as Ints
 
 
 def evenly(count: int, most: int) -> Ints:

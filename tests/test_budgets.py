@@ -13,20 +13,20 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
-    "hma_data": (721, 4_168, 7),
+    "hma_data": (736, 4_256, 8),
     "hma_data/cli": (1_541, 10_988, 8),
-    "hma_data/conversion": (4_140, 30_705, 15),
-    "hma_data/episodes": (1_713, 15_007, 9),
+    "hma_data/conversion": (4_135, 30_589, 15),
+    "hma_data/episodes": (1_706, 14_585, 9),
     "hma_data/hub": (517, 3_857, 3),
-    "hma_data/inspection": (2_110, 19_963, 8),
-    "hma_data/lab": (3_304, 30_340, 16),
-    "hma_data/loading": (1_283, 10_898, 6),
-    "hma_data/registry": (1_274, 8_232, 6),
-    "hma_data/shards": (2_510, 19_421, 11),
-    "hma_data/sources": (12_627, 105_253, 50),
-    "hma_data/storage": (1_690, 11_090, 11),
-    "hma_data/tokenizers": (3_471, 25_528, 18),
-    "hma_model": (569, 3_464, 4),
+    "hma_data/inspection": (2_111, 19_927, 8),
+    "hma_data/lab": (3_297, 29_844, 16),
+    "hma_data/loading": (1_279, 10_782, 6),
+    "hma_data/registry": (1_274, 8_231, 6),
+    "hma_data/shards": (2_502, 19_281, 11),
+    "hma_data/sources": (12_616, 104_626, 50),
+    "hma_data/storage": (1_691, 11_068, 11),
+    "hma_data/tokenizers": (3_466, 25_295, 18),
+    "hma_model": (568, 3_417, 4),
     "hma_model/benchmark": (823, 7_070, 5),
     "hma_model/checkpoint": (945, 7_275, 5),
     "hma_model/cli": (1_771, 11_481, 12),
@@ -44,7 +44,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_693, 30_223, 20),
     "hma_model/worlds": (1_542, 11_886, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_671, 520_535
+PRODUCT_LINES, PRODUCT_NODES = 65_640, 518_367
 TEST_LINES = 48_286
 DOC_WORDS = 41_997
 

@@ -16,7 +16,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 ROOMS = (
     "hma_data.errors", "hma_data.plugins", "hma_data.console", "hma_data.tables", "hma_data.cpu",
-    "hma_data.storage",
+    "hma_data.arrays", "hma_data.storage",
     "hma_data.hub", "hma_data.registry", "hma_data.episodes", "hma_data.sources", "hma_data.tokenizers",
     "hma_data.shards", "hma_data.tokenizers.training", "hma_data.inspection", "hma_data.conversion",
     "hma_data.loading", "hma_data.loader", "hma_data.lab", "hma_data.cli", "hma_data",

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 
+from hma_data.arrays import Array, Images, Ints
 from hma_data.conversion.plan import (
     Plan,
     ShardUnit,
@@ -175,14 +175,14 @@ class Content:
         kept: (N,) frames of the clip that become rows of a camera.
     """
 
-    def __init__(self, clip: Clip, kept: NDArray[np.int64]) -> None:
+    def __init__(self, clip: Clip, kept: Ints) -> None:
         self._digest = hashlib.sha256(f"{clip.episode.instruction}\n{clip.episode.success}".encode())
         for numbers in (clip.timestamps, clip.actions, clip.states, clip.action_known, clip.state_known):
             self._add(numbers)
         self._looked_at = looked_at(len(kept))
-        self._seen: dict[str, list[NDArray[np.uint8]]] = {}  # camera -> its frames that are hashed
+        self._seen: dict[str, list[Images]] = {}  # camera -> its frames that are hashed
 
-    def add(self, camera: str, start: int, frames: NDArray[np.uint8]) -> None:
+    def add(self, camera: str, start: int, frames: Images) -> None:
         """Add the next frames (n, H, W, 3) of a camera; the first of them is its row `start`."""
         seen = self._seen.setdefault(camera, [])
         seen += [frames[row - start].copy() for row in self._looked_at if start <= row < start + len(frames)]
@@ -193,7 +193,7 @@ class Content:
             self._add(frame)
         return self._digest.hexdigest()[:16]
 
-    def _add(self, numbers: NDArray[Any] | None) -> None:
+    def _add(self, numbers: Array | None) -> None:
         if numbers is None:
             self._digest.update(b"none")
         else:
@@ -206,7 +206,7 @@ def looked_at(rows: int) -> list[int]:
     return sorted({0, rows // 2, rows - 1})
 
 
-def kept_frames(clip: Clip, layout: RowLayout) -> NDArray[np.int64]:
+def kept_frames(clip: Clip, layout: RowLayout) -> Ints:
     """Return the frames (N,) of the clip that become rows of a camera."""
     kept = layout.kept(len(clip))
     if not len(kept):

@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
+from hma_data.arrays import Images, Ints
 from hma_data.conversion.engines import Report
 from hma_data.conversion.output import Finished, Made, Share, other_plan
 from hma_data.conversion.plan import EPISODES_TRIED, Plan, Settings, ShardUnit, read_clip
@@ -34,7 +34,6 @@ from hma_data.conversion.reading import (
     Frames,
     Item,
     Job,
-    Pictures,
     ReadEpisode,
     Tick,
     UnitNotes,
@@ -154,7 +153,7 @@ class Columns:
             found[TIMES] = {"dtype": "float64", "shape": (1,), "names": None}
         return found
 
-    def row(self, episode: ReadEpisode, row: int, pictures: dict[str, Pictures]) -> dict[str, Any]:
+    def row(self, episode: ReadEpisode, row: int, pictures: dict[str, Images]) -> dict[str, Any]:
         """Return the values of a row of an episode; its picture of each camera is (H, W, 3)."""
         clip, stride = episode.clip, self.layout.frame_stride
         at = int(episode.kept[row])
@@ -244,7 +243,7 @@ class LeRobotOutput:
         """Yield the frames of an episode, upright (n, H, W, 3); add what they show to its flags."""
         clip, facts = episode.clip, self._job.facts["dataset"]
 
-        def show(name: str, start: int, rows: NDArray[np.int64]) -> tuple[Pictures, Pictures]:
+        def show(name: str, start: int, rows: Ints) -> tuple[Images, Images]:
             camera = self._job.embodiment.camera(name)
             raw = clip.frames_at(name, rows)
             frames = np.ascontiguousarray(upright(raw, camera))
@@ -297,7 +296,7 @@ class PartWriter:
         self._job, self._columns, self._folder, self._report = job, columns, folder, report
         self._writer: DatasetWriter | None = None
         self._begun: ReadEpisode | None = None
-        self._waiting: dict[str, Pictures] = {}  # frames of the next rows, by camera
+        self._waiting: dict[str, Images] = {}  # frames of the next rows, by camera
         self._rows = self._total = 0  # of the episode that was begun, and of those that are saved
 
     def add(self, item: Item) -> None:

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 
+from hma_data.arrays import Ints
 from hma_data.console import human_count
 from hma_data.conversion.settings import Settings
 from hma_data.episodes.align import to_clip
@@ -214,7 +214,7 @@ def shard_size(frames: int) -> int:
 
 
 def pack(
-    split: str, numbers: NDArray[np.int64], refs: Records[EpisodeRef], target: int, begun: int = 0
+    split: str, numbers: Ints, refs: Records[EpisodeRef], target: int, begun: int = 0
 ) -> list[ShardUnit]:
     """Pack episodes (N,) into shards of about `target` frames; `begun` shards of the split exist already."""
     ends = np.cumsum(np.maximum(to_numpy(refs.column("frames")), 1))

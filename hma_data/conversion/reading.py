@@ -19,8 +19,8 @@ from threading import Event, Thread
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Array, Images, Indices, Ints
 from hma_data.conversion.engines import Attempt, Report, Step
 from hma_data.conversion.extend import kept_frames
 from hma_data.conversion.plan import ShardUnit, camera_fault, read_clip
@@ -47,8 +47,6 @@ from hma_data.storage.fetch import disk_is_full, storage_is_away, worth_another_
 
 SIGN_EVERY_S = 20.0
 FATAL = TokenizerError, OutputError, ShardError, RegistryError, MissingDependencyError  # no episode's fault
-
-Pictures = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -105,13 +103,13 @@ class ReadEpisode:
     index: int
     ref: EpisodeRef
     clip: Clip
-    kept: NDArray[np.int64]
+    kept: Ints
     flags: dict[str, int]
     language: Sequence[Mapping[str, Any]] = ()
     content: str = ""
     read: bool = False
     waiting: int = 0
-    tokens: defaultdict[str, list[NDArray[Any]]] = field(default_factory=lambda: defaultdict(list))
+    tokens: defaultdict[str, list[Array]] = field(default_factory=lambda: defaultdict(list))
 
 
 @dataclass(frozen=True)
@@ -119,7 +117,7 @@ class Frames:
     """The next frames (n, H, W, 3) of a camera of the episode that was begun."""
 
     camera: str
-    frames: Pictures
+    frames: Images
 
 
 class End:
@@ -129,7 +127,7 @@ class End:
 # An episode is begun by itself, goes on with its frames, and ends with End; or it is refused.
 Item = ReadEpisode | Frames | End | Refused
 ReadFrames = Callable[[ReadEpisode, Report | None], Iterator[Frames]]
-Show = Callable[[str, int, NDArray[np.int64]], tuple[Pictures, Pictures]]
+Show = Callable[[str, int, Ints], tuple[Images, Images]]
 
 
 def read_unit(
@@ -224,10 +222,10 @@ class _DecodedOnce:
     def __init__(self, stream: Stream) -> None:
         self.timestamps = stream.timestamps
         self._stream = stream
-        self._indices: NDArray[np.int64] = np.zeros(0, np.int64)
-        self._frames: Pictures = np.zeros((0, 1, 1, 3), np.uint8)
+        self._indices: Ints = np.zeros(0, np.int64)
+        self._frames: Images = np.zeros((0, 1, 1, 3), np.uint8)
 
-    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Pictures:
+    def frames(self, indices: Indices) -> Images:
         """See episode.Stream."""
         wanted = np.asarray(indices, np.int64)
         if not np.isin(wanted, self._indices).all():
@@ -236,7 +234,7 @@ class _DecodedOnce:
             self._indices = distinct
         return self._frames[np.searchsorted(self._indices, wanted)]
 
-    def each(self, indices: Sequence[int] | NDArray[np.int64], least: int = 0) -> Iterator[Pictures]:
+    def each(self, indices: Indices, least: int = 0) -> Iterator[Images]:
         """See episode.OneByOne."""
         own = self._stream if isinstance(self._stream, OneByOne) else None
         if own and least:

@@ -11,11 +11,10 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Array, Float32s, Images, Ints
 from hma_data.conversion.engines import Attempt, Report, Work
 from hma_data.conversion.extend import Content
 from hma_data.conversion.lerobot import LeRobotOutput, PartWriter
@@ -26,7 +25,6 @@ from hma_data.conversion.reading import (
     Frames,
     Item,
     Job,
-    Pictures,
     ReadEpisode,
     Tick,
     UnitNotes,
@@ -115,7 +113,7 @@ class ShardOutput:
         clip, spec = episode.clip, self._job.layout.tokenizer
         content = Content(clip, episode.kept)
 
-        def show(name: str, start: int, rows: NDArray[np.int64]) -> tuple[Pictures, Pictures]:
+        def show(name: str, start: int, rows: Ints) -> tuple[Images, Images]:
             camera, stream = self._job.embodiment.camera(name), clip.episode.streams[name]
             indices = clip.frame_indices[name][rows]
             frames = prepared(stream, indices, camera, spec.image_size, spec.resize_filter)
@@ -180,11 +178,11 @@ def _tokenized(
     yield from ready()
 
 
-def _columns(item: ReadEpisode, layout: RowLayout) -> dict[str, NDArray[Any] | None]:
+def _columns(item: ReadEpisode, layout: RowLayout) -> dict[str, Array | None]:
     """Return the columns of the episode's rows; strided rows hold the whole chunk of actions."""
     clip, kept = item.clip, item.kept
     steps = len(kept) * layout.frame_stride
-    actions: NDArray[np.float32] = clip.actions[:steps].reshape(len(kept), -1)
+    actions: Float32s = clip.actions[:steps].reshape(len(kept), -1)
     known = clip.action_known
     if known is not None:
         known = np.all(known[:steps].reshape(len(kept), -1), axis=1)
@@ -207,12 +205,12 @@ class Batches:
         size: frames a call; only `flush` makes a smaller call.
     """
 
-    def __init__(self, encode: Callable[[Pictures], NDArray[Any]], size: int) -> None:
+    def __init__(self, encode: Callable[[Images], Array], size: int) -> None:
         self._encode, self._size = encode, size
-        self._queue: deque[tuple[ReadEpisode, str, Pictures]] = deque()
+        self._queue: deque[tuple[ReadEpisode, str, Images]] = deque()
         self._queued = 0
 
-    def add(self, episode: ReadEpisode, camera: str, frames: Pictures) -> int:
+    def add(self, episode: ReadEpisode, camera: str, frames: Images) -> int:
         """Queue the next frames of an episode's camera; return how many frames were encoded by this call."""
         self._queue.append((episode, camera, frames))
         self._queued += len(frames)
@@ -233,7 +231,7 @@ class Batches:
 
     def _next(self, count: int) -> int:
         owners: list[tuple[ReadEpisode, str, int]] = []
-        pieces: list[Pictures] = []
+        pieces: list[Images] = []
         left = count
         while left:
             episode, camera, frames = self._queue.popleft()

@@ -14,15 +14,15 @@ Times are float64 seconds. T target times, S source times, A values a sample.
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hma_data.episodes.episode import Clip, Episode, Floats, Known, Signal
+from hma_data.arrays import Bools, Float32s, Floats, Ints
+from hma_data.episodes.episode import Clip, Episode, Known, Signal
 from hma_data.episodes.rotations import between
 from hma_data.errors import AlignmentError, EpisodeError
 from hma_data.registry.components import Component
 from hma_data.registry.embodiment import ONE_INDEX, Embodiment
 
-Matches = tuple[NDArray[np.int64], Floats]
+Matches = tuple[Ints, Floats]
 Timed = tuple[str, Floats, str, float]  # name, times, method and tolerance in seconds of a stream
 RATE_TOLERANCE = 0.1  # share of the stated rate by which the measured one may differ
 OFF_RATE = "off_rate_frames"  # the flag of an episode whose grid has another rate
@@ -53,7 +53,7 @@ def nearest(source_times: Floats, target_times: Floats) -> Matches:
     farther = np.abs(source_times[before] - target_times) - np.abs(source_times[after] - target_times)
     chosen = np.where(farther > rounding(source_times, target_times), after, before)
     # Samples with equal stamps: the first of them.
-    index: NDArray[np.int64] = np.searchsorted(source_times, source_times[chosen], side="left")
+    index: Ints = np.searchsorted(source_times, source_times[chosen], side="left")
     return index, np.abs(source_times[index] - target_times) * 1e3
 
 
@@ -72,9 +72,7 @@ def hold(source_times: Floats, target_times: Floats, tolerance_s: float = 0.0) -
     return index, np.where(found < 0, age, np.maximum(age, 0)) * 1e3
 
 
-def interpolate(
-    source_times: Floats, values: NDArray[np.float32], target_times: Floats
-) -> tuple[NDArray[np.float32], Floats]:
+def interpolate(source_times: Floats, values: Float32s, target_times: Floats) -> tuple[Float32s, Floats]:
     """Return values (T, A), linear between neighbours, and skew_ms (T,), the distance to the nearest one."""
     columns = [np.interp(target_times, source_times, column) for column in values.T.astype(np.float64)]
     return np.stack(columns, axis=1).astype(np.float32), nearest(source_times, target_times)[1]
@@ -135,17 +133,17 @@ def _shared_index(episode: Episode, embodiment: Embodiment) -> Clip:
     )  # fmt: skip
 
 
-def _join(signals: Sequence[Signal], index: NDArray[np.int64]) -> tuple[NDArray[np.float32], Known]:
+def _join(signals: Sequence[Signal], index: Ints) -> tuple[Float32s, Known]:
     values = np.concatenate([signal.values for signal in signals], axis=1)[index]
     return _masked(values, [None if signal.known is None else signal.known[index] for signal in signals])
 
 
-def _masked(values: NDArray[np.float32], marks: Sequence[Known]) -> tuple[NDArray[np.float32], Known]:
+def _masked(values: Float32s, marks: Sequence[Known]) -> tuple[Float32s, Known]:
     """Return the values with zeros in rows where a mark is False, and the known rows (None without marks)."""
     stated = [mark for mark in marks if mark is not None]
     if not stated:
         return values, None
-    known: NDArray[np.bool_] = np.logical_and.reduce(stated)
+    known: Bools = np.logical_and.reduce(stated)
     return np.where(known[:, None], values, np.float32(0)), known
 
 
@@ -195,7 +193,7 @@ def _aligned(episode: Episode, embodiment: Embodiment) -> Clip:
     grid, trimmed = _grid(episode.id, frames, embodiment, timed)
 
     skew: dict[str, Floats] = {}
-    indices: dict[str, NDArray[np.int64]] = {}
+    indices: dict[str, Ints] = {}
     for name, stream in episode.streams.items():
         indices[name], skew[name] = matched(sync.images, stream.timestamps, grid)
     # A frame exactly at the limit stays in, whatever its stamp's last digit.
@@ -232,7 +230,7 @@ def _aligned(episode: Episode, embodiment: Embodiment) -> Clip:
 
 def _moved(
     signal: Signal, components: tuple[Component, ...], method: str, grid: Floats, tolerance_s: float
-) -> tuple[NDArray[np.float32], Known, Floats]:
+) -> tuple[Float32s, Known, Floats]:
     """Return the values (T, A) of a signal on the grid, which of them are known (T,), and skew_ms (T,)."""
     if method != "interpolate":
         index, skew = matched(method, signal.timestamps, grid, tolerance_s)

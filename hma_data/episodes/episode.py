@@ -4,18 +4,17 @@ An Episode is lazy: it knows its times and values, and decodes a picture only wh
 T frames, A values a sample; times are float64 seconds, pictures uint8 RGB.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Bools, Float32s, Floats, Images, Indices, Ints
 from hma_data.errors import EpisodeError
 
-Floats = NDArray[np.float64]
-Known = NDArray[np.bool_] | None
-Decode = Callable[..., NDArray[np.uint8]]  # index -> (H, W, 3) RGB
+Known = Bools | None
+Decode = Callable[..., Images]  # index -> (H, W, 3) RGB
 
 
 class Stream(Protocol):
@@ -23,7 +22,7 @@ class Stream(Protocol):
 
     timestamps: Floats  # (T,) seconds
 
-    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
+    def frames(self, indices: Indices) -> Images:
         """Return the pictures (n, H, W, 3) RGB of those indices; decode no others."""
 
 
@@ -34,13 +33,13 @@ class OneByOne(Protocol):
     A class that inherits it has `Stream.frames` by its `each`.
     """
 
-    def each(self, indices: Sequence[int] | NDArray[np.int64], least: int = 0) -> Iterator[NDArray[np.uint8]]:
+    def each(self, indices: Indices, least: int = 0) -> Iterator[Images]:
         """Yield (H, W, 3) RGB of each of those indices in order; each is valid until the next request.
 
         With `least`, JPEG is decoded at a reduced size, as `hma_data.episodes.images.decode_image` does.
         """
 
-    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
+    def frames(self, indices: Indices) -> Images:
         """Return pictures by index; see Stream."""
         return all_of(self, indices)
 
@@ -56,7 +55,7 @@ class Signal:
     """
 
     timestamps: Floats
-    values: NDArray[np.float32]
+    values: Float32s
     known: Known = None
 
     def __post_init__(self) -> None:
@@ -113,9 +112,9 @@ class Clip:
 
     episode: Episode
     timestamps: Floats
-    actions: NDArray[np.float32]
-    states: NDArray[np.float32] | None
-    frame_indices: dict[str, NDArray[np.int64]]
+    actions: Float32s
+    states: Float32s | None
+    frame_indices: dict[str, Ints]
     skew_ms: dict[str, Floats]
     trimmed: int = 0
     repeated: int = 0
@@ -126,12 +125,12 @@ class Clip:
         return len(self.timestamps)
 
     @property
-    def known_actions(self) -> NDArray[np.float32]:
+    def known_actions(self) -> Float32s:
         """Return the actions (N, A) that are known."""
         return self.actions if self.action_known is None else self.actions[self.action_known]
 
     @property
-    def known_states(self) -> NDArray[np.float32] | None:
+    def known_states(self) -> Float32s | None:
         """Return the states (N, A') that are known; None where there are no states."""
         if self.states is None or self.state_known is None:
             return self.states
@@ -146,7 +145,7 @@ class Clip:
         found["repeated_frames"] = self.repeated
         return {name: count for name, count in found.items() if count}
 
-    def frames_at(self, camera: str, grid: NDArray[np.int64]) -> NDArray[np.uint8]:
+    def frames_at(self, camera: str, grid: Ints) -> Images:
         """Return the pictures (n, H, W, 3) of those grid frames."""
         return self.episode.streams[camera].frames(self.frame_indices[camera][grid])
 
@@ -164,13 +163,13 @@ class Pictures(OneByOne):
         self.timestamps = timestamps
         self._decode, self._reduces = decode, reduces
 
-    def each(self, indices: Sequence[int] | NDArray[np.int64], least: int = 0) -> Iterator[NDArray[np.uint8]]:
+    def each(self, indices: Indices, least: int = 0) -> Iterator[Images]:
         """Yield pictures one by one; see OneByOne."""
         more = (least,) if self._reduces else ()
         return (self._decode(int(index), *more) for index in indices)
 
 
-def of_one_size(pictures: Iterable[NDArray[np.uint8]], where: str) -> Iterator[NDArray[np.uint8]]:
+def of_one_size(pictures: Iterable[Images], where: str) -> Iterator[Images]:
     """Yield pictures (H, W, 3); raise EpisodeError at the first whose size differs."""
     first: tuple[int, ...] = ()
     for picture in pictures:
@@ -181,9 +180,9 @@ def of_one_size(pictures: Iterable[NDArray[np.uint8]], where: str) -> Iterator[N
         yield picture
 
 
-def stacked(pictures: Iterable[NDArray[np.uint8]], count: int, where: str = "") -> NDArray[np.uint8]:
+def stacked(pictures: Iterable[Images], count: int, where: str = "") -> Images:
     """Return pictures of one size as (count, H, W, 3); only one of them is in memory twice."""
-    found: NDArray[np.uint8] = np.zeros((0, 1, 1, 3), np.uint8)
+    found: Images = np.zeros((0, 1, 1, 3), np.uint8)
     for i, picture in enumerate(of_one_size(pictures, where)):
         if i == 0:
             found = np.empty((count, *picture.shape), np.uint8)
@@ -191,7 +190,7 @@ def stacked(pictures: Iterable[NDArray[np.uint8]], count: int, where: str = "") 
     return found
 
 
-def all_of(stream: OneByOne, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[np.uint8]:
+def all_of(stream: OneByOne, indices: Indices) -> Images:
     """Return the pictures (n, H, W, 3) of indices in any order; each is decoded once, in rising order."""
     distinct, places = np.unique(np.asarray(indices, np.int64), return_inverse=True)
     found = stacked(stream.each(distinct), len(distinct))

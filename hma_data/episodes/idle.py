@@ -14,8 +14,8 @@ T frames, A values.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Bools, Float32s, Floats, Ints
 from hma_data.episodes.episode import Clip
 from hma_data.registry.components import Action, Component, Vector
 from hma_data.registry.embodiment import Embodiment
@@ -26,7 +26,7 @@ NOISE = 0.001
 MOTIONS = ("eef_delta", "joint_delta", "joint_velocity", "base_velocity")
 
 
-def idle_frames(clip: Clip, embodiment: Embodiment) -> NDArray[np.bool_]:
+def idle_frames(clip: Clip, embodiment: Embodiment) -> Bools:
     """Return which frames (T,) of a clip are idle."""
     values, limits = _numbers(clip, embodiment)
     idle = np.zeros(len(clip), np.bool_)
@@ -43,7 +43,7 @@ def idle_frames(clip: Clip, embodiment: Embodiment) -> NDArray[np.bool_]:
     return idle
 
 
-def idle_rows(clip: Clip, embodiment: Embodiment, kept: NDArray[np.int64], stride: int) -> NDArray[np.bool_]:
+def idle_rows(clip: Clip, embodiment: Embodiment, kept: Ints, stride: int) -> Bools:
     """Return which of the rows are idle: those whose `stride` frames from `kept` (N,) on are all idle."""
     idle = idle_frames(clip, embodiment)
     return np.asarray(idle[kept[:, None] + np.arange(stride)].all(axis=1), np.bool_)
@@ -61,7 +61,7 @@ def _may_be_motion(part: Component, action: Action) -> bool:
     return unknown or _is_motion(part, action)
 
 
-def _numbers(clip: Clip, embodiment: Embodiment) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _numbers(clip: Clip, embodiment: Embodiment) -> tuple[Floats, Floats]:
     """Return the values (T, n) of action and state that are no motions, and by how much each may change."""
     action = embodiment.action
     found = [values for part, values in _parts(clip.actions, action) if not _is_motion(part, action)]
@@ -71,12 +71,12 @@ def _numbers(clip: Clip, embodiment: Embodiment) -> tuple[NDArray[np.float64], N
     return np.concatenate([none, *found], axis=1), np.concatenate([none[0], *map(_limits, found)])
 
 
-def _limits(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _limits(values: Floats) -> Floats:
     widest = float(np.ptp(values, axis=0).max())
     return np.full(values.shape[1], max(STILL * widest, NOISE))
 
 
-def _motions(clip: Clip, action: Action) -> NDArray[np.bool_]:
+def _motions(clip: Clip, action: Action) -> Bools:
     """Return at which frames (T,) a command that may be a motion by itself is not near zero."""
     asked = np.zeros(len(clip), np.bool_)
     for part, values in _parts(clip.actions, action):
@@ -85,5 +85,5 @@ def _motions(clip: Clip, action: Action) -> NDArray[np.bool_]:
     return asked
 
 
-def _parts(values: NDArray[np.float32], vector: Vector) -> list[tuple[Component, NDArray[np.float64]]]:
+def _parts(values: Float32s, vector: Vector) -> list[tuple[Component, Floats]]:
     return [(part, values[:, span].astype(np.float64)) for part, span in vector.spans()]

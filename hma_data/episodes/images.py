@@ -5,17 +5,16 @@ tokenizer's spec because it changes the tokens.
 """
 
 import os
-from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.arrays import Images, Indices
 from hma_data.episodes.episode import OneByOne, Stream
 from hma_data.errors import EpisodeError, MissingDependencyError
 from hma_data.registry.components import Camera, Quality
 
-Images = NDArray[np.uint8]
 Filter = Literal["area", "linear", "antialias"]
 _REDUCED = ((8, 64), (4, 32), (2, 16))  # share of a JPEG's sides, and the flag of cv2.IMREAD_REDUCED_*
 TIFF = (b"II*\0", b"MM\0*")
@@ -171,7 +170,7 @@ def prepare(
 
 def prepared(
     stream: Stream,
-    indices: Sequence[int] | NDArray[np.int64],
+    indices: Indices,
     camera: Camera,
     size: int,
     resize_filter: Filter = "area",

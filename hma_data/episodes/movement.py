@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hma_data.episodes.images import Images, opencv
+from hma_data.arrays import Bools, Images, Ints
+from hma_data.episodes.images import opencv
 from hma_data.registry.components import Camera
 
 Box = tuple[int, int, int, int]
@@ -28,7 +28,7 @@ NARROWEST = 48  # pixels: least side of a proposed crop
 LOST_SHARE = 0.5  # the robot is lost where decoded frames show less than this share of the change
 
 
-def moving(film: Images) -> NDArray[np.bool_]:
+def moving(film: Images) -> Bools:
     """Return which pixels of (n, H, W, 3) frames move, (n, H, W): unlike the frame before or after."""
     masks = np.zeros(film.shape[:3], np.bool_)
     changed = np.abs(np.diff(film.astype(np.int16), axis=0)).max(axis=-1) > MOVING_THRESHOLD
@@ -85,7 +85,7 @@ class MovingPart:
         return x, y, wide, tall
 
 
-def _ends(counts: NDArray[np.int64]) -> tuple[int, int]:
+def _ends(counts: Ints) -> tuple[int, int]:
     """Return the first place that counts and the one after the last, without the strays."""
     share = np.cumsum(counts) / counts.sum()
     return int(np.searchsorted(share, STRAYS, "right")), int(np.searchsorted(share, 1 - STRAYS)) + 1

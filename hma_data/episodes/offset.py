@@ -18,10 +18,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Floats
 from hma_data.episodes.align import hold
-from hma_data.episodes.episode import Floats
 
 STEADY_SHARE = 0.9  # least share of actions near their usual place between frames
 NEAR_PART = 0.25  # part of an interval within which an action is near it
@@ -124,7 +123,7 @@ def measure(runs: Sequence[tuple[Floats, Floats]], camera: str = "") -> Offset |
     return replace(found, tolerance_ms=round(tolerance) if tolerance >= 10 else round(tolerance, 1))
 
 
-def _after(parts: NDArray[np.float64]) -> NDArray[np.float64] | None:
+def _after(parts: Floats) -> Floats | None:
     """Return the distances of commands from their pictures, in intervals; None without a steady place.
 
     Args:
@@ -142,6 +141,6 @@ def _after(parts: NDArray[np.float64]) -> NDArray[np.float64] | None:
     return after
 
 
-def _middle(values: NDArray[np.float64]) -> tuple[float, float]:
+def _middle(values: Floats) -> tuple[float, float]:
     low, median, high = np.percentile(values, [5, 50, 95])
     return float(median), float(high - low) / 2

@@ -8,10 +8,8 @@ S samples, T target times, A numbers of a component. A pose of 6 or 7 numbers is
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Values = NDArray[np.float32]
+from hma_data.arrays import Float32s, Floats, Ints
 
 _WIDTHS = {
     "quaternion_xyzw": 4,
@@ -25,8 +23,8 @@ _DEGREES = ("deg", "degree", "degrees", "°")
 
 
 def between(
-    source_times: Floats, values: Values, target_times: Floats, representation: str, unit: str | None = None
-) -> Values:
+    source_times: Floats, values: Float32s, target_times: Floats, representation: str, unit: str | None = None
+) -> Float32s:
     """Return the values (T, A) of a component between its samples.
 
     Args:
@@ -139,7 +137,7 @@ def _nearest_rotation(values: Floats) -> Floats:
     return np.where(whole[:, None, None], left @ right, matrices).reshape(-1, 9)
 
 
-def _index_of_nearest(source_times: Floats, target_times: Floats) -> NDArray[np.int64]:
+def _index_of_nearest(source_times: Floats, target_times: Floats) -> Ints:
     after = np.clip(np.searchsorted(source_times, target_times), 0, len(source_times) - 1)
     before = np.maximum(after - 1, 0)
     nearer = np.abs(source_times[after] - target_times) <= np.abs(source_times[before] - target_times)

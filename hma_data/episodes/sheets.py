@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hma_data.episodes.images import Images, opencv
+from hma_data.arrays import Float32s, Floats, Images
+from hma_data.episodes.images import opencv
 from hma_data.storage.files import atomic_path, write_atomic
 
 CELL = 128  # pixels of a side of a picture in a sample, about
@@ -22,7 +22,7 @@ INK, PAPER = (30, 30, 30), (250, 250, 250)
 BAR, NEGATIVE = (0, 114, 178), (213, 94, 0)  # safe without colour vision
 
 
-def grid(rows: Sequence[Sequence[NDArray[np.uint8]]], labels: Sequence[str] = ()) -> Images:
+def grid(rows: Sequence[Sequence[Images]], labels: Sequence[str] = ()) -> Images:
     """Return a picture (H, W, 3) of pictures of one size in rows, with a label above each row."""
     label_height = LABEL if labels else 0
     height, width = rows[0][0].shape[:2]
@@ -99,9 +99,9 @@ def _ascii(text: str) -> str:
 
 def with_actions(
     frames: Images,
-    actions: NDArray[np.float32],
-    low: NDArray[np.float64],
-    high: NDArray[np.float64],
+    actions: Float32s,
+    low: Floats,
+    high: Floats,
     names: Sequence[str] = (),
 ) -> Images:
     """Return frames (N, H, W, 3) with a bar below them for each action dim, from `low` to `high` (A,).

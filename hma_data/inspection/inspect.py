@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Array, Float32s, Floats
 from hma_data.episodes.align import (
     hold,
     is_off_rate,
@@ -23,7 +23,7 @@ from hma_data.episodes.align import (
     rate_remedy,
     to_clip,
 )
-from hma_data.episodes.episode import Clip, Floats
+from hma_data.episodes.episode import Clip
 from hma_data.episodes.images import describe_resize
 from hma_data.episodes.movement import framing
 from hma_data.episodes.offset import Offset, measure
@@ -180,7 +180,7 @@ def _alike(robot: Embodiment, inspection: Inspection) -> str:
     return f" (recorded keys like it: {', '.join(near)})" if near else ""
 
 
-def _constant(deviations: NDArray[Any], robot: Embodiment) -> list[str]:
+def _constant(deviations: Array, robot: Embodiment) -> list[str]:
     """Return the names of actions that never change; in a chunk, one name stands for several columns."""
     names = robot.action.names()
     keys = [part.key for part in robot.action.components for _ in range(part.dims)]
@@ -428,7 +428,7 @@ def _times(clips: list[Clip], robot: Embodiment) -> Iterator[Finding]:
             yield Finding("skew", "warn", f"{stream} was moved by {late:.1f} ms or more in 5 % of frames")
 
 
-def _numbers(actions: NDArray[np.float32], robot: Embodiment) -> Iterator[Finding]:
+def _numbers(actions: Float32s, robot: Embodiment) -> Iterator[Finding]:
     names = robot.action.names()
     spread = actions.std(axis=0)
     if constant := _constant(spread, robot):

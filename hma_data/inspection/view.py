@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.arrays import Array, Images, Ints
 from hma_data.episodes.align import to_clip
 from hma_data.episodes.episode import Clip
-from hma_data.episodes.images import Images, opencv, prepared
+from hma_data.episodes.images import opencv, prepared
 from hma_data.errors import MissingDependencyError, UsageError, install_command
 from hma_data.registry.embodiment import Embodiment, find
 from hma_data.shards.preview import tokenizer_of
@@ -80,7 +81,7 @@ class View:
             self._stream.send_columns(entity, self._clock(rows), columns)
             start += len(jpegs)
 
-    def curves(self, entity: str, values: NDArray[Any], names: Sequence[str]) -> None:
+    def curves(self, entity: str, values: Array, names: Sequence[str]) -> None:
         """Add values (T, A), one curve a column; NaN leaves a gap."""
         self._draw(entity, self._clock(np.arange(len(values))), values, names)
 
@@ -110,11 +111,11 @@ class View:
         """Open the viewer on this machine's display."""
         self._stream.spawn(default_blueprint=self._blueprint())
 
-    def _clock(self, rows: NDArray[np.int64]) -> list[Any]:
+    def _clock(self, rows: Ints) -> list[Any]:
         rr = self._rr
         return [rr.TimeColumn("time", duration=self.times[rows]), rr.TimeColumn("frame", sequence=rows)]
 
-    def _draw(self, entity: str, index: list[Any], values: NDArray[Any], names: Sequence[str]) -> None:
+    def _draw(self, entity: str, index: list[Any], values: Array, names: Sequence[str]) -> None:
         rr = self._rr
         self._drawn.append(entity)
         self._stream.log(entity, rr.SeriesLines(names=list(names)), static=True)
@@ -202,7 +203,7 @@ def view_shards(folder: StrPath, episode: int = 0, tokenizer: Tokenizer | None =
     return view
 
 
-def _vectors(view: View, robot: Embodiment, actions: NDArray[Any], *others: NDArray[Any] | None) -> None:
+def _vectors(view: View, robot: Embodiment, actions: Array, *others: Array | None) -> None:
     """Add the curves of the actions, and of the others: states, then which actions and states are known."""
     states, *known = others
     drawn = (("actions", actions, robot.action), ("states", states, robot.state))
@@ -220,7 +221,7 @@ def _coded(clip: Clip, robot: Embodiment, camera: str, tokenizer: Tokenizer) -> 
         yield tokenizer.decode(tokenizer.encode(frames))
 
 
-def _parts(values: NDArray[Any]) -> Iterator[NDArray[Any]]:
+def _parts(values: Array) -> Iterator[Array]:
     return (values[start : start + FRAMES_AT_ONCE] for start in range(0, len(values), FRAMES_AT_ONCE))
 
 

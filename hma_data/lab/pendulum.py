@@ -13,12 +13,11 @@ from itertools import count
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Float32s, Floats, Images
 from hma_data.lab import imported
 from hma_data.lab.writers import RldsEpisode, write_rlds
 
-Floats = NDArray[np.float64]
 Manoeuvre = Callable[[float, float], float]  # (angle, speed) -> torque
 
 STEPS, PERIOD_S = 100, 0.05
@@ -62,7 +61,7 @@ class Pendulum:
         return float(self._env.state[1])
 
     @property
-    def observed(self) -> NDArray[np.float32]:
+    def observed(self) -> Float32s:
         """Return (3,) cosine and sine of the angle, and the speed: the environment's observation."""
         return np.array([np.cos(self.angle), np.sin(self.angle), self.speed], dtype=np.float32)
 
@@ -76,16 +75,16 @@ class Pendulum:
         """Return no places (0, 2): nothing lies loose."""
         return np.empty((0, 2))
 
-    def picture(self) -> NDArray[np.uint8]:
+    def picture(self) -> Images:
         """Render the rod; (SIZE, SIZE, 3) RGB."""
         import cv2
 
         edge = (DRAWN - ZOOMED) // 2
         pixels = np.ascontiguousarray(self._env.render()[edge : edge + ZOOMED, edge : edge + ZOOMED])
-        small: NDArray[np.uint8] = cv2.resize(pixels, (SIZE, SIZE), interpolation=cv2.INTER_AREA)
+        small: Images = cv2.resize(pixels, (SIZE, SIZE), interpolation=cv2.INTER_AREA)
         return small
 
-    def advance(self, action: NDArray[np.float32]) -> None:
+    def advance(self, action: Float32s) -> None:
         """Simulate one period under a torque (1,)."""
         self._env.step(action)
 
@@ -96,13 +95,13 @@ def start(seed: int, episode: int) -> tuple[Pendulum, np.random.Generator]:
     return Pendulum(rng.uniform(-np.pi, np.pi), rng.uniform(-4, 4)), rng
 
 
-def begin(robot: str, seed: int, episode: int) -> tuple[Pendulum, Callable[[], NDArray[np.float32]]]:
+def begin(robot: str, seed: int, episode: int) -> tuple[Pendulum, Callable[[], Float32s]]:
     """Return the simulation of an episode at its start, and the recorder's driver of torques (1,)."""
     world, rng = start(seed, episode)
     _, manoeuvre = DRIVERS[episode % len(DRIVERS)]
     drive = manoeuvre(rng)
 
-    def act() -> NDArray[np.float32]:
+    def act() -> Float32s:
         return np.array([np.clip(drive(world.angle, world.speed), -TORQUE, TORQUE)], dtype=np.float32)
 
     return world, act

@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Float32s, Floats, Images
 from hma_data.lab import imported
-from hma_data.lab.family.look import SCALE, SIZE, Color, Floats, Shape, box, draw, shrunk
+from hma_data.lab.family.look import SCALE, SIZE, Color, Shape, box, draw, shrunk
 from hma_data.lab.writers import Demo, block_demo, write_hdf5
 from hma_data.registry.embodiment import find
 from hma_data.sources.lerobot.writer import LeRobotEpisode, write_lerobot
@@ -132,7 +132,7 @@ class PlanarArm:
         return {"joint_pos": self.angles, "joint_vel": self.velocities}
 
     @property
-    def observed(self) -> NDArray[np.float32]:
+    def observed(self) -> Float32s:
         """Return (2·J,) joint angles and velocities, as recorded."""
         return np.concatenate([self.angles, self.velocities]).astype(np.float32)
 
@@ -156,14 +156,14 @@ class PlanarArm:
         """Return (2·J + 3·B,): joint angles and velocities, poses of the blocks."""
         return np.concatenate([self.angles, self.velocities, self.blocks.ravel()])
 
-    def advance(self, action: NDArray[np.float32]) -> None:
+    def advance(self, action: Float32s) -> None:
         """Simulate one frame with the motors set to velocities (J,)."""
         for motor, velocity in zip(self._motors, action, strict=True):
             motor.rate = -float(velocity)  # pymunk's rate is that of the first body relative to the second
         for _ in range(TICKS):
             self._space.step(1 / (HZ * TICKS))
 
-    def picture(self) -> NDArray[np.uint8]:
+    def picture(self) -> Images:
         """Draw the arm and the blocks; (SIZE, SIZE, 3) RGB."""
         shapes = []
         for pose, color in zip(self.blocks, BLOCK_COLORS, strict=True):
@@ -214,7 +214,7 @@ def start(seed: int, episode: int) -> tuple[PlanarArm, np.random.Generator]:
     return PlanarArm(joints, np.stack(blocks)), rng
 
 
-def begin(robot: str, seed: int, episode: int) -> tuple[PlanarArm, Callable[[], NDArray[np.float32]]]:
+def begin(robot: str, seed: int, episode: int) -> tuple[PlanarArm, Callable[[], Float32s]]:
     """Return the simulation of an episode at its start, and the recorder's driver."""
     arm, rng = start(seed, episode)
     return arm, driver(arm, rng)
@@ -233,7 +233,7 @@ def _link(here: Floats, there: Floats, color: Color) -> list[Shape]:
 # -- driver
 
 
-def driver(arm: PlanarArm, rng: np.random.Generator) -> Callable[[], NDArray[np.float32]]:
+def driver(arm: PlanarArm, rng: np.random.Generator) -> Callable[[], Float32s]:
     """Return the recorder's driver, which returns the next velocities (J,).
 
     It runs manoeuvres of 0.3 to 1.5 s, and turns the elbow back before its stops.
@@ -241,7 +241,7 @@ def driver(arm: PlanarArm, rng: np.random.Generator) -> Callable[[], NDArray[np.
     left = 0
     manoeuvre: Manoeuvre = _rest
 
-    def drive() -> NDArray[np.float32]:
+    def drive() -> Float32s:
         nonlocal left, manoeuvre
         if left == 0:
             kind = rng.choice(4, p=(0.45, 0.25, 0.2, 0.1))

@@ -16,9 +16,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from hma_data.arrays import Floats, Ints
 
 LOW, HIGH = 22.0, 490.0  # range of the pusher's centre: its radius inside the walls
 GAP = 11.0  # distance between pusher and T before a push
@@ -173,7 +172,7 @@ def _walks(tee: Tee, agent: Floats, pose: Floats) -> tuple[Floats, Callable[[int
     local = ((agent - pose[:2]) @ turn)[None]
     usable = _inside(tee.corners @ turn.T + pose[:2])
     reach = np.where(usable, tee.legs(local, tee.corners)[0], np.inf)
-    previous: NDArray[np.int64] = np.full(len(reach), -1)
+    previous: Ints = np.full(len(reach), -1)
     to_corners, to_standoffs = tee.from_corners
     for _ in range(len(reach)):
         longer = reach[:, None] + to_corners

@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hma_data.lab.pusher import Floats, Planned, Tee, Wandering, rotation
+from hma_data.arrays import Float32s, Floats, Images
+from hma_data.lab.pusher import Planned, Tee, Wandering, rotation
 from hma_data.lab.tee_table import GOAL, SIDE, TICK_S, TeeTable
 from hma_data.lab.writers import BagEpisode, Demo, write_hdf5, write_mcap
 
@@ -120,7 +120,7 @@ class PushArena:
         """Return (5,) pusher x, y, T x, y, angle: the environment's observation."""
         return np.append(np.concatenate([self.agent, self.pose[:2]]), self.pose[2] % (2 * np.pi))
 
-    def picture(self) -> NDArray[np.uint8]:
+    def picture(self) -> Images:
         """Render the arena; (size, size, 3) RGB."""
         return self._table.picture(self._size)
 
@@ -165,14 +165,12 @@ class _Pusher:
         """Return two places (2, 2) of the T in a frame of 128 px: its origin, and a point on its stem."""
         return tee_places(self.arena.pose)
 
-    def picture(self) -> NDArray[np.uint8]:
+    def picture(self) -> Images:
         """Render the arena; (size, size, 3) RGB."""
         return self.arena.picture()
 
 
-def begin(
-    robot: str, seed: int, episode: int
-) -> "tuple[FastPusher | SlowPusher, Callable[[], NDArray[np.float32]]]":
+def begin(robot: str, seed: int, episode: int) -> "tuple[FastPusher | SlowPusher, Callable[[], Float32s]]":
     """Return the simulation of an episode at its start, and the recorder's driver."""
     pusher = FastPusher(seed, episode) if robot == "pusht_fast" else SlowPusher(seed, episode)
     return pusher, pusher.driver()
@@ -203,15 +201,15 @@ class FastPusher(_Pusher):
         self.arena = PushArena(look, self.start, self.rng)
 
     @property
-    def observed(self) -> NDArray[np.float32]:
+    def observed(self) -> Float32s:
         """Return the centre (2,) of the pusher, as recorded."""
         return self.arena.agent.astype(np.float32)
 
-    def advance(self, action: NDArray[np.float32]) -> None:
+    def advance(self, action: Float32s) -> None:
         """Simulate 0.1 s with the target at (x, y)."""
         self.arena.advance(action.astype(np.float64), round(FAST_PERIOD_S / TICK_S))
 
-    def driver(self) -> Callable[[], NDArray[np.float32]]:
+    def driver(self) -> Callable[[], Float32s]:
         """Return the recorder's driver of the episode, which returns the next action (2,)."""
         arena = self.arena
         targets = Targets(_policy(arena, self.rng, self.start, fly=False), arena.agent)
@@ -230,11 +228,11 @@ class Targets:
         self._policy, self._setpoint = policy, agent
 
     @property
-    def held(self) -> NDArray[np.float32]:
+    def held(self) -> Float32s:
         """Return the action (2,) that lets the pusher stay at the last setpoint."""
         return _within(self._setpoint).astype(np.float32)
 
-    def next(self, pose: Floats, agent: Floats) -> NDArray[np.float32]:
+    def next(self, pose: Floats, agent: Floats) -> Float32s:
         """Return the next action (2,), for a pose (3,) of the T and a place (2,) of the pusher."""
         ahead, _ = self._policy.act(pose, agent, FAST_PERIOD_S)
         lead = (LAG_S - FAST_PERIOD_S / 2) / FAST_PERIOD_S
@@ -243,7 +241,7 @@ class Targets:
         return target.astype(np.float32)
 
 
-def pusher_of(agent: Floats, rng: np.random.Generator) -> Callable[[Floats, Floats], NDArray[np.float32]]:
+def pusher_of(agent: Floats, rng: np.random.Generator) -> Callable[[Floats, Floats], Float32s]:
     """Return a driver of pusht_fast that looks: from the pose (3,) of the T and the place of the pusher.
 
     It plans as the recorder's does, and stays where it is once the T lies on its goal.
@@ -251,7 +249,7 @@ def pusher_of(agent: Floats, rng: np.random.Generator) -> Callable[[Floats, Floa
     goal = np.array(GOAL)
     targets = Targets(Planned(tee(), goal, agent, SPEED, False, rng), agent)
 
-    def drive(pose: Floats, agent: Floats) -> NDArray[np.float32]:
+    def drive(pose: Floats, agent: Floats) -> Float32s:
         off = np.linalg.norm(tee().placed(pose) - tee().placed(goal), axis=-1).mean()
         return targets.held if off < PLACED_PX else targets.next(pose, agent)
 
@@ -308,11 +306,11 @@ class SlowPusher(_Pusher):
         self.velocity: Floats = np.zeros(2)
 
     @property
-    def observed(self) -> NDArray[np.float32]:
+    def observed(self) -> Float32s:
         """Return (3,) the centre of the pusher, and 1 if it is up, as recorded."""
         return np.append(self.arena.agent, self.arena.raised).astype(np.float32)
 
-    def take(self, action: Floats | NDArray[np.float32]) -> None:
+    def take(self, action: Floats | Float32s) -> None:
         """Set the velocity (vx, vy) in px/s, and raise or lower the pusher."""
         self.velocity = action[:2].astype(np.float64)
         self.arena.lift(bool(action[2] > 0.5))
@@ -322,7 +320,7 @@ class SlowPusher(_Pusher):
         self.setpoint = _within(self.setpoint + self.velocity * ticks * TICK_S)
         self.arena.advance(_within(self.setpoint + self.velocity * (LAG_S - ticks * TICK_S / 2)), ticks)
 
-    def advance(self, action: Floats | NDArray[np.float32]) -> None:
+    def advance(self, action: Floats | Float32s) -> None:
         """Simulate the time from one frame to the next under an action (3,)."""
         self.take(action)
         self.run(CAMERA_TICKS)
@@ -340,12 +338,12 @@ class SlowPusher(_Pusher):
 
         return action
 
-    def driver(self) -> Callable[[], NDArray[np.float32]]:
+    def driver(self) -> Callable[[], Float32s]:
         """Return a driver that returns (3,) the action in force at each frame, as it is recorded."""
         commander, due = self.commander(), self.arena.ticks
         held: Floats = np.zeros(3)
 
-        def drive() -> NDArray[np.float32]:
+        def drive() -> Float32s:
             nonlocal due, held
             if self.arena.ticks >= due:
                 held, due = commander(), due + COMMAND_TICKS

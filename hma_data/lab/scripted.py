@@ -14,13 +14,13 @@ from types import SimpleNamespace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Float32s, Floats, Ints
 from hma_data.lab import FAMILY, planar_arm, pusht
 from hma_data.lab.family.bodies import Body
 from hma_data.lab.family.driver import Driver, Reacher
 from hma_data.lab.family.table import REACH, BlockTable
-from hma_data.lab.simulator import Floats, Simulation
+from hma_data.lab.simulator import Simulation
 
 PUSHER = "pusht_fast"
 STARTS, ROUNDS = 24, 8  # random poses that a first search begins from, and steps of a search
@@ -52,7 +52,7 @@ def state_of(simulation: Simulation) -> SceneState:
     return SceneState(simulation.angles, simulation.loose, False)
 
 
-def reacher(robot: str) -> Callable[[SceneState], NDArray[np.float32]]:
+def reacher(robot: str) -> Callable[[SceneState], Float32s]:
     """Return a driver of a robot of the family that goes to the block that lies nearest.
 
     Raises:
@@ -62,7 +62,7 @@ def reacher(robot: str) -> Callable[[SceneState], NDArray[np.float32]]:
     return lambda state: drive(state.pose, state.blocks, state.holding).astype(np.float32)
 
 
-def driver(robot: str, pose: Floats, rng: np.random.Generator) -> Callable[[SceneState], NDArray[np.float32]]:
+def driver(robot: str, pose: Floats, rng: np.random.Generator) -> Callable[[SceneState], Float32s]:
     """Return a driver that begins at a pose (Q,): from a state it tells the next action (A,)."""
     if FAMILY.fullmatch(robot):
         drive = Driver(Body.of(robot), pose, rng)
@@ -73,7 +73,7 @@ def driver(robot: str, pose: Floats, rng: np.random.Generator) -> Callable[[Scen
     arm = SimpleNamespace(angles=pose, blocks=np.zeros((1, 2)))
     next_command = planar_arm.driver(arm, rng)  # type: ignore[arg-type]
 
-    def action(state: SceneState) -> NDArray[np.float32]:
+    def action(state: SceneState) -> Float32s:
         arm.angles, arm.blocks = state.pose, state.blocks / planar_arm.PX
         return next_command()
 
@@ -87,14 +87,14 @@ class SeenState(Protocol):
     def state(self) -> SceneState:
         """Return the state as it is now."""
 
-    def move(self, action: NDArray[np.float32]) -> None:
+    def move(self, action: Float32s) -> None:
         """Take an action (A,) that was given, until the next frame."""
 
     def see(self, places: Floats) -> None:
         """Take the places (P + B, 2) of a new frame."""
 
 
-def seen_state(robot: str, own: NDArray[np.int64], places: Floats) -> SeenState:
+def seen_state(robot: str, own: Ints, places: Floats) -> SeenState:
     """Return the state of a steerable robot in a first frame.
 
     Args:
@@ -118,7 +118,7 @@ class SeenPush:
     def state(self) -> SceneState:
         return SceneState(self._agent, self._tee, False)
 
-    def move(self, action: NDArray[np.float32]) -> None:
+    def move(self, action: Float32s) -> None:
         self._agent = self._agent + (action - self._agent) * (1 - np.exp(-pusht.FAST_PERIOD_S / pusht.LAG_S))
 
     def see(self, places: Floats) -> None:
@@ -128,7 +128,7 @@ class SeenPush:
 class SeenPose:
     """The state of a robot of the family or `planar_arm`; the arguments are those of `seen_state`."""
 
-    def __init__(self, robot: str, own: NDArray[np.int64], places: Floats) -> None:
+    def __init__(self, robot: str, own: Ints, places: Floats) -> None:
         self._own = own
         self._body = Body.of(robot) if FAMILY.fullmatch(robot) else None
         self._forward = planar_arm.link_middles if self._body is None else self._body.own
@@ -147,7 +147,7 @@ class SeenPose:
             holding = bool((np.linalg.norm(self._blocks - tip, axis=1) < REACH).any())
         return SceneState(self.pose, self._blocks, holding)
 
-    def move(self, action: NDArray[np.float32]) -> None:
+    def move(self, action: Float32s) -> None:
         if self._body is None:
             self.pose = self.pose + action / planar_arm.HZ
         else:

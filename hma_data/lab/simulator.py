@@ -16,23 +16,22 @@ from importlib import import_module
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Float32s, Floats, Images
 from hma_data.episodes.images import prepare
 from hma_data.errors import UsageError
 from hma_data.lab import FAMILY, RECORDERS, family
 from hma_data.registry.embodiment import Embodiment, find
 
 SIZE = 128  # pixels: the side of the frames
-Floats = NDArray[np.float64]
-Driver = Callable[[], NDArray[np.float32]]
+Driver = Callable[[], Float32s]
 
 
 class Simulation(Protocol):
     """A robot and what is around it."""
 
     @property
-    def observed(self) -> NDArray[np.float32]:
+    def observed(self) -> Float32s:
         """Return the state (S,) that is recorded with a frame."""
 
     @property
@@ -43,10 +42,10 @@ class Simulation(Protocol):
     def loose(self) -> Floats:
         """Return the places (L, 2) of what lies loose."""
 
-    def picture(self) -> NDArray[np.uint8]:
+    def picture(self) -> Images:
         """Draw the scene, as the camera records it."""
 
-    def advance(self, action: NDArray[np.float32], /) -> None:
+    def advance(self, action: Float32s, /) -> None:
         """Simulate one control step under an action (A,)."""
 
 
@@ -66,36 +65,36 @@ class LabSimulator:
         self.embodiment = embodiment(robot)
         self.reset(seed)
 
-    def reset(self, seed: int, episode: int = 0) -> NDArray[np.uint8]:
+    def reset(self, seed: int, episode: int = 0) -> Images:
         """Begin the scene of an episode that `hma_data.lab.record` numbers so; return its first frame."""
         robot = self.embodiment.id
         module, _ = RECORDERS.get(robot, ("hma_data.lab.family", ""))
         begun: tuple[Simulation, Driver] = import_module(module).begin(robot, seed, episode)
         self.seed, self.episode = seed, episode
         self.simulation, self._driver = begun
-        self._commands: list[NDArray[np.float32]] = []
+        self._commands: list[Float32s] = []
         return self.picture()
 
     @property
-    def state(self) -> NDArray[np.float32]:
+    def state(self) -> Float32s:
         """Return the state (S,) that is recorded with the frame."""
         return self.simulation.observed
 
-    def picture(self) -> NDArray[np.uint8]:
+    def picture(self) -> Images:
         """Return the scene as the camera sees it; (SIZE, SIZE, 3) RGB."""
         return prepare(self.simulation.picture()[None], self.embodiment.cameras[0], SIZE)[0]
 
-    def step(self, action: NDArray[np.float32]) -> NDArray[np.uint8]:
+    def step(self, action: Float32s) -> Images:
         """Simulate one control step under an action (A,), and return the frame after it."""
         self.advance(action)
         return self.picture()
 
-    def advance(self, action: NDArray[np.float32]) -> None:
+    def advance(self, action: Float32s) -> None:
         """Simulate one control step under an action (A,), without a frame."""
         self._commands.append(np.array(action, np.float32))
         self.simulation.advance(self._commands[-1])
 
-    def recorded(self) -> NDArray[np.float32]:
+    def recorded(self) -> Float32s:
         """Return the action (A,) that the recorder's driver gives here; call it once a step.
 
         From the beginning of a scene on, these are the actions of the recorded episode.

@@ -10,10 +10,9 @@ Lengths are pixels of the 512 × 512 table with y downward, angles radians, time
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Floats, Images
 from hma_data.lab import imported
-from hma_data.lab.pusher import Floats
 
 SIDE = 512
 TICK_S = 0.01  # step of the physics
@@ -96,7 +95,7 @@ class TeeTable:
     def _outlines(self, body: Any) -> list[Floats]:
         return [np.array([body.local_to_world(v) for v in bar.get_vertices()]) for bar in self.bars]
 
-    def picture(self, size: int) -> NDArray[np.uint8]:
+    def picture(self, size: int) -> Images:
         """Draw the goal, the T and the disc; (size, size, 3) RGB."""
         import cv2
 
@@ -108,7 +107,7 @@ class TeeTable:
             game.draw.polygon(screen, game.Color("LightGreen"), points)
         self._space.debug_draw(_pencil(screen))
         pixels = np.frombuffer(game.image.tobytes(screen, "RGB"), np.uint8).reshape(SIDE, SIDE, 3)
-        small: NDArray[np.uint8] = cv2.resize(pixels, (size, size))
+        small: Images = cv2.resize(pixels, (size, size))
         return small
 
 

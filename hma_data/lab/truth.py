@@ -14,11 +14,11 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Float32s, Floats, Images
 from hma_data.lab import pusht
 from hma_data.lab.family.look import SIZE as SIZE
-from hma_data.lab.simulator import Floats, LabSimulator, Simulation
+from hma_data.lab.simulator import LabSimulator, Simulation
 
 PUSHERS = ("pusht_fast", "pusht_slow")
 
@@ -35,10 +35,10 @@ class TrueEpisode:
         driven: how many of the parts, the first ones, are the robot's own; the others lie loose.
     """
 
-    pictures: NDArray[np.uint8]
-    chunks: NDArray[np.float32]
+    pictures: Images
+    chunks: Float32s
     parts: Floats
-    states: NDArray[np.float32]
+    states: Float32s
     driven: int
 
 

@@ -16,8 +16,8 @@ from typing import Any, Protocol
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Array, Float32s, Floats, Images
 from hma_data.sources.rlds.records import masked_crc
 
 DISTRO = "jazzy"  # of ROS
@@ -31,10 +31,10 @@ _CORE = "tensorflow_datasets.core.features"
 class Demo:
     """One episode of T frames for HDF5."""
 
-    actions: NDArray[np.float32]  # (T, A)
-    observations: Mapping[str, NDArray[Any]]  # key -> (T, …); uint8 (T, H, W, 3) are images
-    states: NDArray[np.float64]  # (T, S), the states of the simulator
-    rewards: NDArray[np.float64]  # (T,)
+    actions: Float32s  # (T, A)
+    observations: Mapping[str, Array]  # key -> (T, …); uint8 (T, H, W, 3) are images
+    states: Floats  # (T, S), the states of the simulator
+    rewards: Floats  # (T,)
     success: bool  # whether the task was done at the end
     facts: Mapping[str, str | int | float]  # stored as attributes
 
@@ -43,27 +43,25 @@ class BlockWorld(Protocol):
     """A simulated robot among loose blocks, as `block_demo` records it."""
 
     @property
-    def joints(self) -> Mapping[str, NDArray[np.float64]]:
+    def joints(self) -> Mapping[str, Floats]:
         """Return what the robot measures of itself: key -> (n,)."""
 
     @property
-    def blocks(self) -> NDArray[np.float64]:
+    def blocks(self) -> Floats:
         """Return the places of the blocks: (B, 2), or (B, 3) with their angles."""
 
     @property
-    def state(self) -> NDArray[np.float64]:
+    def state(self) -> Floats:
         """Return the whole state (S,)."""
 
-    def picture(self) -> NDArray[np.uint8]:
+    def picture(self) -> Images:
         """Draw the scene."""
 
-    def advance(self, action: NDArray[np.float32], /) -> None:
+    def advance(self, action: Float32s, /) -> None:
         """Simulate one control step."""
 
 
-def block_demo(
-    world: BlockWorld, drive: Callable[[], NDArray[np.float32]], steps: int, moved: float, seed: int
-) -> Demo:
+def block_demo(world: BlockWorld, drive: Callable[[], Float32s], steps: int, moved: float, seed: int) -> Demo:
     """Record `steps` frames; the reward is the way that the blocks moved, success that one moved `moved`."""
     first = before = world.blocks[:, :2].copy()
     rows: list[tuple[Any, ...]] = []
@@ -143,7 +141,7 @@ class RldsEpisode:
     """One episode of T steps for RLDS."""
 
     pictures: Mapping[str, list[bytes]]  # path inside a step -> T files, JPEG or PNG
-    vectors: Mapping[str, NDArray[np.float32]]  # path inside a step -> (T, A)
+    vectors: Mapping[str, Float32s]  # path inside a step -> (T, A)
     instruction: str  # the task in words
     facts: Mapping[str, bool | int | str] = field(default_factory=dict)  # stored as episode_metadata
 
@@ -280,7 +278,7 @@ class BagEpisode:
         self._frame = frame
         self._rng = rng
 
-    def image(self, at_ns: int, picture: NDArray[np.uint8]) -> None:
+    def image(self, at_ns: int, picture: Images) -> None:
         """Add a frame (H, W, 3) RGB as a PNG."""
         import cv2
 
@@ -291,14 +289,12 @@ class BagEpisode:
             "/camera/image/compressed", "sensor_msgs/msg/CompressedImage", at_ns, late, "camera", fields
         )
 
-    def joints(
-        self, at_ns: int, names: list[str], position: NDArray[Any], velocity: NDArray[np.float64]
-    ) -> None:
+    def joints(self, at_ns: int, names: list[str], position: Array, velocity: Floats) -> None:
         """Add what the robot measures of itself (n,)."""
         fields = {"name": names, "position": position, "velocity": velocity, "effort": np.empty(0)}
         self._add("/joint_states", "sensor_msgs/msg/JointState", at_ns, self._soon(), self._frame, fields)
 
-    def command(self, at_ns: int, values: NDArray[np.float64]) -> None:
+    def command(self, at_ns: int, values: Floats) -> None:
         """Add an action of up to three values, as a twist's linear part."""
         linear, angular = (
             ros_value("geometry_msgs/msg/Vector3", *part.tolist())

@@ -21,13 +21,14 @@ import numpy as np
 from torch import cuda
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
+from hma_data.arrays import Indices, Ints
 from hma_data.errors import ShardError, UsageError
 from hma_data.loading.mixture import TEMPERATURES, Mixture
 from hma_data.loading.pools import UnitAssignment, WindowSequence, pool_size
 from hma_data.loading.rows import MIB, Batch, RowDecoder, as_batch, assemble
 from hma_data.loading.views import FIRST_CAMERA, Cameras, Views, by_number, view_count
 from hma_data.shards.reader import ShardSet
-from hma_data.shards.windows import Ints, Short
+from hma_data.shards.windows import Short
 from hma_data.storage.paths import StrPath
 
 AHEAD, AHEAD_BYTES = 32, 8 * MIB  # most batches of a lane that are cut together, and their windows
@@ -112,7 +113,7 @@ class WindowDataset(Dataset[Batch]):
     def __getitems__(self, windows: list[int]) -> Batch:
         return self.batch(windows)  # a DataLoader calls this where a dataset makes whole batches
 
-    def batch(self, windows: Sequence[int] | Ints) -> Batch:
+    def batch(self, windows: Indices) -> Batch:
         """Return those windows as one batch, in that order.
 
         Raises:

@@ -14,13 +14,12 @@ from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Floats, Indices, Ints
 from hma_data.errors import UsageError
 from hma_data.storage.files import atomic_path
 from hma_data.storage.paths import StrPath, as_path
 
-Floats = NDArray[np.float64]
 Draw = Literal["per_sample", "per_batch"]
 BLUE, ORANGE, GREY = "#0072b2", "#e69f00", "#666666"  # told apart without colour vision
 LONGEST_NAME = 34
@@ -144,7 +143,7 @@ class Mixture:
         edges[-1] = 1.0
         return edges
 
-    def batch(self, step: int, size: int) -> NDArray[np.int64]:
+    def batch(self, step: int, size: int) -> Ints:
         """Return the index (B,) of each sample's embodiment in batch `step`, the same in every process."""
         rng = np.random.Generator(np.random.Philox(key=[self.seed, step]))
         draws = np.searchsorted(
@@ -152,7 +151,7 @@ class Mixture:
         )
         return np.broadcast_to(draws, (size,)).astype(np.int64)
 
-    def table(self, drawn: Sequence[int] | NDArray[np.int64]) -> list[dict[str, float | str | int]]:
+    def table(self, drawn: Indices) -> list[dict[str, float | str | int]]:
         """Return a table of what was drawn beside what was intended.
 
         Args:

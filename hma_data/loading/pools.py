@@ -8,13 +8,12 @@ reader, position in the sequence), so continuing from any position costs the dec
 
 import zlib
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Array, Ints
 from hma_data.loading.rows import RowDecoder, Rows
-from hma_data.shards.windows import Ints, WindowIndex
+from hma_data.shards.windows import WindowIndex
 
 UNITS = 8  # at least so many per reader: with fewer units, shares are less equal
 LARGEST_POOL = 8  # row groups
@@ -128,7 +127,7 @@ class WindowSequence:
         self._rows: Rows | None = None
         self._view: Ints | None = None
 
-    def take(self, start: int, count: int) -> dict[str, NDArray[Any]]:
+    def take(self, start: int, count: int) -> dict[str, Array]:
         """Return windows start to start + count of the sequence: those of `Rows.cut`, and camera (n,)."""
         cuts = []
         while count:

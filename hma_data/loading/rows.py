@@ -16,11 +16,12 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hma_data.arrays import Array, Bools, Float32s, Ints
 from hma_data.errors import ShardError, UsageError
 from hma_data.loading.views import FIRST_CAMERA, Cameras, Views, stacked
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import mask_columns, token_column
-from hma_data.shards.windows import Ints, Short, WindowIndex
+from hma_data.shards.windows import Short, WindowIndex
 from hma_data.tokenizers.base import TokenizerSpec
 
 MIB = 2**20
@@ -30,14 +31,14 @@ MIB = 2**20
 class Rows:
     """Decoded rows, from which windows are cut."""
 
-    tokens: NDArray[Any]  # (N, S), or (N, V, S) of several cameras
-    actions: NDArray[np.float32]
+    tokens: Array  # (N, S), or (N, V, S) of several cameras
+    actions: Float32s
     episode: NDArray[np.int32]
     frame: NDArray[np.int32]
-    known: NDArray[np.bool_] | None  # True where the row's action is known; None where all are
+    known: Bools | None  # True where the row's action is known; None where all are
 
     def __post_init__(self) -> None:
-        self._of_span: tuple[int, NDArray[np.float32], NDArray[np.bool_] | None] | None = None
+        self._of_span: tuple[int, Float32s, Bools | None] | None = None
 
     @classmethod
     def join(cls, several: "Sequence[Rows]") -> "Rows":
@@ -59,7 +60,7 @@ class Rows:
 
     def cut(
         self, first: Ints, last: Ints | None, index: WindowIndex, view: Ints | None = None
-    ) -> dict[str, NDArray[Any]]:
+    ) -> dict[str, Array]:
         """Return the windows that start at rows `first` (n,).
 
         Args:
@@ -71,7 +72,7 @@ class Rows:
             has marks or windows may be padded, also known (n, T) bool. Where windows may be padded, also
             inside (n, T) bool, True for frames of the episode.
         """
-        found: dict[str, NDArray[Any]] = {"episode": self.episode[first], "frame": self.frame[first]}
+        found: dict[str, Array] = {"episode": self.episode[first], "frame": self.frame[first]}
         if last is not None:
             return found | self._padded(first, last, index, view)
         found["tokens"] = self._frames(first[:, None] + index.offsets, view)
@@ -81,7 +82,7 @@ class Rows:
             found["known"] = np.all(known[first].reshape(len(first), index.frames, -1), axis=2)
         return found
 
-    def _spans(self, span: int) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
+    def _spans(self, span: int) -> tuple[Float32s, Bools | None]:
         """Return the actions (N - span + 1, span * A) and marks of every run of `span` rows; made once."""
         if self._of_span is None or self._of_span[0] != span:
             # Rows lie one after the other in memory, so a run of rows is a run of numbers: every window is a
@@ -91,12 +92,10 @@ class Rows:
             self._of_span = span, sliding_window_view(flat, span * width)[::width], known
         return self._of_span[1:]
 
-    def _frames(self, rows: Ints, view: Ints | None) -> NDArray[Any]:
+    def _frames(self, rows: Ints, view: Ints | None) -> Array:
         return self.tokens[rows] if view is None else self.tokens[rows, view[:, None]]
 
-    def _padded(
-        self, first: Ints, last: Ints, index: WindowIndex, view: Ints | None
-    ) -> dict[str, NDArray[Any]]:
+    def _padded(self, first: Ints, last: Ints, index: WindowIndex, view: Ints | None) -> dict[str, Array]:
         every = first[:, None] + np.arange(index.span)
         inside = every <= last[:, None]
         every = np.minimum(every, last[:, None])
@@ -203,7 +202,7 @@ class RowDecoder:
         actions, episode, frame, *known = (values[name] for name in self._columns)
         return Rows(tokens, actions, episode, frame, known[0] if known else None)
 
-    def _check(self, shard: str, values: dict[str, NDArray[Any]]) -> None:
+    def _check(self, shard: str, values: dict[str, Array]) -> None:
         """Raise ShardError for tokens or actions that would spoil the training without an error."""
         actions, episode, frame = (values[name] for name in self._columns[:3])
         size, fault = self.shards.spec.vocab_size, ""
@@ -286,7 +285,7 @@ class Batch:
 def assemble(
     spec: TokenizerSpec,
     names: list[str],
-    windows_of: Mapping[str, tuple[Ints, dict[str, NDArray[Any]]]],
+    windows_of: Mapping[str, tuple[Ints, dict[str, Array]]],
     short: Short,
     views: int = 1,
     size: int | None = None,
@@ -316,7 +315,7 @@ def assemble(
     where = {key: np.concatenate([cut[key] for cut in cuts]) for key in ("episode", "frame", "camera")}
     discrete, size = spec.kind == "discrete", size or count
 
-    def pictures(values: NDArray[Any]) -> Tensor:
+    def pictures(values: Array) -> Tensor:
         taken = stacked(values, spec, views)
         return torch.from_numpy(np.ascontiguousarray(taken, np.int64 if discrete else np.float32))
 

@@ -10,15 +10,13 @@ n windows, T frames, V views, h·w grid, c channels.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Array, Ints
 from hma_data.errors import UsageError
 from hma_data.registry.embodiment import FIRST_CAMERA
 from hma_data.shards.reader import ShardSet
-from hma_data.shards.windows import Ints
 from hma_data.tokenizers.base import TokenizerSpec
 
 Cameras = str | Sequence[str]
@@ -88,7 +86,7 @@ def by_number(windows: Ints) -> Ints:
     return (mixed >> np.uint64(33)).astype(np.int64)
 
 
-def stacked(tokens: NDArray[Any], spec: TokenizerSpec, views: int) -> NDArray[Any]:
+def stacked(tokens: Array, spec: TokenizerSpec, views: int) -> Array:
     """Stack the views of frames (n, T, …) along the height: (n, T, V·h, w) or (n, T, c, V·h, w)."""
     (h, w), (samples, frames) = spec.grid, tokens.shape[:2]
     if spec.kind == "discrete":

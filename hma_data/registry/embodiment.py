@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 
 from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator
 
+from hma_data.arrays import Bools
 from hma_data.errors import RegistryError
 from hma_data.registry.components import (
     LAYOUTS,
@@ -39,8 +40,7 @@ from hma_data.storage.paths import StrPath, as_path, as_text
 from hma_data.storage.yaml_io import Problem, parse_yaml, plain_fault, read_yaml, write_yaml
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+    pass
 
 FIRST_CAMERA = "first"  # stands for the first camera of a set, whatever its name
 ID_PATTERN = re.compile(r"[a-z0-9][a-z0-9_.-]{0,99}")
@@ -239,7 +239,7 @@ class Embodiment(SpecModel):
         return self if kept == self.cameras else self.model_copy(update={"cameras": kept})
 
     @property
-    def normalize_mask(self) -> "NDArray[np.bool_]":
+    def normalize_mask(self) -> "Bools":
         """Return (A,) bool, True where the model normalizes the value."""
         import numpy as np
 

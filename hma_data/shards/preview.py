@@ -12,14 +12,13 @@ from typing import Any
 
 import numpy as np
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 
+from hma_data.arrays import Images, Ints
 from hma_data.episodes.images import describe_resize, opencv
 from hma_data.episodes.sheets import (
     GAP,
     LABEL,
     PAPER,
-    Images,
     fitted,
     grid,
     with_actions,
@@ -240,7 +239,7 @@ class _Seen:
             words.insert(0, "recording not at hand")
         self.label = "   ".join(word for word in words if word)
 
-    def _images(self, rows: NDArray[np.int64]) -> dict[str, Images]:
+    def _images(self, rows: Ints) -> dict[str, Images]:
         """Return what is shown -> images (n, S, S, 3) of some rows, each camera recorded and decoded."""
         found: dict[str, Images] = {}
         for camera, tokens in self._tokens.items():
@@ -250,7 +249,7 @@ class _Seen:
             found[f"{named}decoded"] = self._tokenizer.decode(self._shards.tokens(tokens[rows]))
         return found
 
-    def _with_actions(self, images: Images, rows: NDArray[np.int64]) -> Images:
+    def _with_actions(self, images: Images, rows: Ints) -> Images:
         """Return the images (n, H, W, 3) of some rows with their actions as bars below them."""
         stats = self._shards.manifest.stats["action"]
         low, high = np.array(stats["min"]), np.array(stats["max"])

@@ -22,8 +22,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
+from hma_data.arrays import Array, Ints
 from hma_data.errors import ShardError, UsageError
 from hma_data.shards.manifest import EPISODES, MANIFEST, QUARANTINE, Manifest, ShardFile, restat_remedy
 from hma_data.shards.schema import flag_pauses, mask_columns, to_numpy, token_column
@@ -32,7 +32,6 @@ from hma_data.storage.kinds import misplaced
 from hma_data.storage.paths import StrPath
 from hma_data.storage.remote import RemotePath, parquet_file, place, remote_file
 
-Ints = NDArray[np.int64]
 CACHE_VARIABLE, DEFAULT_GB = "HMA_CACHE_GB", 20.0
 IN_USE_S = 3600.0
 DOWNLOADED_BYTES = 8 << 20  # of a shard at once
@@ -107,7 +106,7 @@ class ShardSet:
             raise ShardError(path, text, restat_remedy(self.folder))
         return table
 
-    def recordings(self, episodes: Iterable[int]) -> NDArray[np.int64]:
+    def recordings(self, episodes: Iterable[int]) -> Ints:
         """Return the number of the recording of each of some episodes, which those of one group share."""
         known = dict[tuple[str, str], int]()
         own = {}
@@ -167,7 +166,7 @@ class ShardSet:
         pauses = _pauses(flags[0][mine], flags[1], self.manifest.frame_stride)
         return EpisodeIndex(index, shard, start, length, pauses)
 
-    def read(self, shard: str, row_groups: Sequence[int], columns: Sequence[str]) -> dict[str, NDArray[Any]]:
+    def read(self, shard: str, row_groups: Sequence[int], columns: Sequence[str]) -> dict[str, Array]:
         """Read columns of some row groups of a shard, (N,) or (N, width) each.
 
         Raises:
@@ -203,9 +202,7 @@ class ShardSet:
     def _bytes(self) -> int:
         return sum(shard.bytes for shard in self.manifest.shards)
 
-    def episode_rows(
-        self, episode_index: int, columns: Sequence[str] | None = None
-    ) -> dict[str, NDArray[Any]]:
+    def episode_rows(self, episode_index: int, columns: Sequence[str] | None = None) -> dict[str, Array]:
         """Read all rows of one episode."""
         wanted = pa.scalar(episode_index)  # for a plain number pyarrow would import pandas
         found = self.episodes.filter(pc.equal(self.episodes["episode_index"], wanted)).to_pylist()
@@ -215,7 +212,7 @@ class ShardSet:
         reader = EpisodeReader(self, columns or [token_column(self.spec)[0], "action", "timestamp"])
         return reader.rows(row["shard"], row["row_start"], row["rows"])
 
-    def tokens(self, rows: NDArray[Any]) -> NDArray[Any]:
+    def tokens(self, rows: Array) -> Array:
         """Reshape (N, width) values of the token column to (N, h, w) or (N, c, h, w)."""
         h, w = self.spec.grid
         if self.spec.kind == "discrete":
@@ -241,7 +238,7 @@ class EpisodeReader:
         listed = shards.listed
         self._edges = lru_cache(64)(lambda shard: np.cumsum([0, *listed[shard].row_groups], dtype=np.int64))
 
-    def episode(self, row: Mapping[str, Any], camera: str) -> dict[str, NDArray[Any]]:
+    def episode(self, row: Mapping[str, Any], camera: str) -> dict[str, Array]:
         """Read the columns of an episode, (T,) or (T, width) each, as one camera recorded it.
 
         Args:
@@ -257,7 +254,7 @@ class EpisodeReader:
         kept = {name: column for name, column in values.items() if name not in columns}
         return {token_column(layout.tokenizer)[0]: values[layout.token_columns[camera]], **kept}
 
-    def rows(self, shard: str, row_start: int, rows: int) -> dict[str, NDArray[Any]]:
+    def rows(self, shard: str, row_start: int, rows: int) -> dict[str, Array]:
         """Read columns of `rows` rows of a shard from `row_start` on, (rows,) or (rows, width) each."""
         edges = self._edges(shard)
         first = int(np.searchsorted(edges, row_start, side="right")) - 1

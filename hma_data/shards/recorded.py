@@ -5,11 +5,9 @@ N frames, H×W pixels as recorded, S pixels a side as the tokenizer saw them.
 
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from hma_data.arrays import Images, Ints
 from hma_data.episodes.align import to_clip
-from hma_data.episodes.images import Images, prepare
+from hma_data.episodes.images import prepare
 from hma_data.errors import EpisodeError
 from hma_data.shards.reader import ShardSet
 from hma_data.sources.base import open_source
@@ -32,11 +30,11 @@ class Recorded:
         if len(manifest.layout.kept(len(self.clip))) != row["length"]:
             raise EpisodeError(row["id"], f"has another length in {uri} than in {shards.folder}")
 
-    def raw(self, camera: str, rows: NDArray[np.int64]) -> Images:
+    def raw(self, camera: str, rows: Ints) -> Images:
         """Return the frames (N, H, W, 3) of rows of the episode, as they were recorded."""
         return self.clip.frames_at(camera, rows * self._shards.manifest.frame_stride)
 
-    def frames(self, camera: str, rows: NDArray[np.int64]) -> Images:
+    def frames(self, camera: str, rows: Ints) -> Images:
         """Return the frames (N, S, S, 3) of rows of the episode, as the tokenizer saw them."""
         robot, spec = self._shards.embodiment, self._shards.spec
         return prepare(self.raw(camera, rows), robot.camera(camera), spec.image_size, spec.resize_filter)

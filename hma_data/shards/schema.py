@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
+from hma_data.arrays import Array, Ints
 from hma_data.errors import ShardError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.stats import Stats
@@ -316,7 +316,7 @@ class RowLayout:
             mask_columns(self.embodiment),
         )
 
-    def kept(self, length: int) -> NDArray[np.int64]:
+    def kept(self, length: int) -> Ints:
         """Return the frames (N,) of a clip of `length` frames that become rows."""
         return np.arange(0, length // self.frame_stride * self.frame_stride, self.frame_stride)
 
@@ -324,7 +324,7 @@ class RowLayout:
         """Return the statistics of no rows, by vector."""
         return {name: Stats.empty(width) for name, width in self.widths.items()}
 
-    def stats(self, columns: Mapping[str, NDArray[Any]], rows: slice) -> dict[str, Stats]:
+    def stats(self, columns: Mapping[str, Array], rows: slice) -> dict[str, Stats]:
         """Return the statistics of some rows of the columns (N, width), by vector; skip unknown values."""
         found = {}
         for name, width in self.widths.items():
@@ -347,7 +347,7 @@ def encodings(schema: pa.Schema) -> dict[str, str]:
     return chosen
 
 
-def to_arrow(column: pa.Field, values: NDArray[Any]) -> pa.Array:
+def to_arrow(column: pa.Field, values: Array) -> pa.Array:
     """Convert a numpy array (N, …) to the arrow array of that column."""
     if pa.types.is_fixed_size_list(column.type):
         flat = pa.array(np.ascontiguousarray(values).reshape(-1), type=column.type.value_type)
@@ -355,7 +355,7 @@ def to_arrow(column: pa.Field, values: NDArray[Any]) -> pa.Array:
     return pa.array(values, type=column.type)
 
 
-def to_numpy(column: pa.ChunkedArray) -> NDArray[Any]:
+def to_numpy(column: pa.ChunkedArray) -> Array:
     """Convert a column to numpy (N,) or (N, width), without a copy if arrow allows it."""
     array = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
     if pa.types.is_fixed_size_list(array.type):
@@ -366,7 +366,7 @@ def to_numpy(column: pa.ChunkedArray) -> NDArray[Any]:
 _NUMPY = {"halffloat": "float16", "float": "float32", "double": "float64"}  # where arrow's names differ
 
 
-def _flat(array: pa.Array) -> NDArray[Any]:
+def _flat(array: pa.Array) -> Array:
     """Convert like array.to_numpy, without its import of pandas, which takes a second and 50 MB a worker."""
     name = str(array.type)
     plain = pa.types.is_integer(array.type) or pa.types.is_floating(array.type)

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from hma_data.arrays import Array, Float32s
+
 QUANTILES = (0.01, 0.05, 0.10, 0.25, 0.50, 0.75, 0.90, 0.95, 0.99)
 LEVEL = 256
 
@@ -29,10 +29,10 @@ class QuantileSketch:
         odd: level -> which of a pair the next compaction keeps; it alternates to keep the error unbiased.
     """
 
-    levels: list[NDArray[np.float32]] = field(default_factory=list)
+    levels: list[Float32s] = field(default_factory=list)
     odd: list[int] = field(default_factory=list)
 
-    def add(self, values: NDArray[Any]) -> None:
+    def add(self, values: Array) -> None:
         """Add rows (N, A)."""
         for start in range(0, len(values), 4 * LEVEL):
             self._extend(0, values[start : start + 4 * LEVEL].astype(np.float32))
@@ -44,7 +44,7 @@ class QuantileSketch:
             self._extend(level, values)
         self._compact()
 
-    def _extend(self, level: int, values: NDArray[np.float32]) -> None:
+    def _extend(self, level: int, values: Float32s) -> None:
         while len(self.levels) <= level:
             self.levels.append(np.zeros((0, values.shape[1]), np.float32))
             self.odd.append(0)
@@ -95,9 +95,7 @@ class QuantileSketch:
             raise ValueError(f"a sketch of {values['rows']} rows holds other than {size} bytes")
         flat = np.frombuffer(packed, "<f4")
         parts = np.split(flat, np.cumsum([n * values["width"] for n in values["rows"]])[:-1])
-        levels: list[NDArray[np.float32]] = [
-            part.reshape(-1, values["width"]).astype(np.float32) for part in parts
-        ]
+        levels: list[Float32s] = [part.reshape(-1, values["width"]).astype(np.float32) for part in parts]
         return cls(levels, list(values["odd"]))
 
 
@@ -124,7 +122,7 @@ class Stats:
         return cls(0, np.zeros(width), np.zeros(width), np.full(width, np.inf), np.full(width, -np.inf))
 
     @classmethod
-    def of(cls, values: NDArray[Any]) -> "Stats":
+    def of(cls, values: Array) -> "Stats":
         """Return the statistics of rows (N, A)."""
         rows = np.asarray(values, np.float64)
         if not len(rows):

@@ -15,8 +15,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
+from hma_data.arrays import Array
 from hma_data.cpu import in_order, usable_cores
 from hma_data.errors import HMAError
 from hma_data.shards.manifest import (
@@ -157,7 +157,7 @@ def _footer_problems(
     return found
 
 
-def _read_rows(path: Path, manifest: Manifest) -> tuple[dict[str, NDArray[Any]], list[str]]:
+def _read_rows(path: Path, manifest: Manifest) -> tuple[dict[str, Array], list[str]]:
     """Return all columns except the tokens, and what is wrong with the tokens and numbers."""
     names, size = sorted({*manifest.layout.token_columns.values()}), manifest.tokenizer.vocab_size
     found: list[str] = []
@@ -185,7 +185,7 @@ def _read_rows(path: Path, manifest: Manifest) -> tuple[dict[str, NDArray[Any]],
     return columns, found
 
 
-def _row_problems(columns: dict[str, NDArray[Any]], footer: Footer) -> list[str]:
+def _row_problems(columns: dict[str, Array], footer: Footer) -> list[str]:
     """Check rows against the footer: whole episodes, frames that count up, zeros where nothing is known."""
     found: list[str] = []
     length = to_numpy(footer.table["length"])
@@ -203,7 +203,7 @@ def _row_problems(columns: dict[str, NDArray[Any]], footer: Footer) -> list[str]
     return found
 
 
-def _stats_problems(columns: dict[str, NDArray[Any]], footer: Footer, manifest: Manifest) -> list[str]:
+def _stats_problems(columns: dict[str, Array], footer: Footer, manifest: Manifest) -> list[str]:
     """Return where the footer's statistics are not those of its rows.
 
     The footer's statistics of a strided set count steps that its rows lack: a few steps at an episode's end,

@@ -19,7 +19,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from hma_data.shards.reader import EpisodeIndex, Ints, ShardSet
+from hma_data.arrays import Ints
+from hma_data.shards.reader import EpisodeIndex, ShardSet
 from hma_data.shards.schema import flag_pauses
 
 Short = Literal["drop", "pad"]

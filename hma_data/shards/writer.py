@@ -4,13 +4,12 @@ from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
+from hma_data.arrays import Array
 from hma_data.shards.schema import GROUP_VALUES, ROW_GROUP, Footer, encodings, to_arrow, token_column
 from hma_data.storage.files import atomic_path, file_sha256
 from hma_data.tokenizers.base import TokenizerSpec
@@ -54,7 +53,7 @@ class ShardWriter:
             self._atomic = opening.pop_all()
         return self
 
-    def add(self, episode_index: int, columns: Mapping[str, NDArray[Any] | None]) -> None:
+    def add(self, episode_index: int, columns: Mapping[str, Array | None]) -> None:
         """Append an episode; a row group holds whole episodes if they fit.
 
         Args:

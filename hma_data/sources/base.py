@@ -12,8 +12,8 @@ from importlib import import_module
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Array, Float32s
 from hma_data.episodes.episode import Episode
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.plugins import SOURCE_GROUP, installed
@@ -141,7 +141,7 @@ def open_source(name: str) -> Source:
 # -- vectors
 
 
-def compose(vector: Vector, pieces: Sequence[NDArray[Any]], where: str) -> NDArray[np.float32]:
+def compose(vector: Vector, pieces: Sequence[Array], where: str) -> Float32s:
     """Return a vector over time, joined from the recorded values of its components.
 
     Slices, signs and offsets are applied only here.
@@ -167,19 +167,19 @@ def compose(vector: Vector, pieces: Sequence[NDArray[Any]], where: str) -> NDArr
     return np.concatenate(parts, axis=1)
 
 
-def read_vector(vector: Vector, read: Callable[[str], NDArray[Any]], where: str) -> NDArray[np.float32]:
+def read_vector(vector: Vector, read: Callable[[str], Array], where: str) -> Float32s:
     """Return a vector over time; `read` returns the recorded values of a key, and is asked once for each."""
     values = {key: read(key) for key in dict.fromkeys(part.key for part in vector.components)}
     return compose(vector, [values[part.key] for part in vector.components], where)
 
 
-def component_values(part: Any, piece: NDArray[Any], where: str) -> NDArray[np.float32]:
+def component_values(part: Any, piece: Array, where: str) -> Float32s:
     """Return the values (T, dims) float32 of one component; see `compose`."""
     if piece.dtype.kind not in "fiub":
         raise EpisodeError(where, f"{part.key} holds {piece.dtype}, not numbers")
     if piece.ndim < 1 or not len(piece):
         raise EpisodeError(where, f"{part.key} holds no values over time (shape {piece.shape})")
-    values: NDArray[Any] = piece.reshape(len(piece), -1)
+    values: Array = piece.reshape(len(piece), -1)
     width = values.shape[1]
     if part.slice:
         fault = f"{part.key} has {width} values, slice {list(part.slice)} needs {part.slice[1]}"

@@ -19,7 +19,8 @@ from threading import Lock
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
+
+from hma_data.arrays import Ints
 
 BLOCK = 1 << 20  # bytes of a request
 BLOCKS_AHEAD = 32  # expected blocks on their way while one is read
@@ -91,7 +92,7 @@ class Blocks:
         self.size = size
         self._fetch = fetch
         self._number = next(_numbers)
-        self._expected: NDArray[np.int64] = np.zeros(0, np.int64)
+        self._expected: Ints = np.zeros(0, np.int64)
         self._next: Blocks | None = None
 
     def expect(self, parts: Iterable[tuple[int, int]]) -> None:

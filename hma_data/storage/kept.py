@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Array
 from hma_data.errors import OutputError
 from hma_data.storage.files import remove_dead_parts, write_atomic
 
@@ -45,7 +45,7 @@ class KeptParts:
         """Return the file of a part."""
         return self.folder / f"{key}.npz"
 
-    def part(self, key: str, make: Callable[[], Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
+    def part(self, key: str, make: Callable[[], Mapping[str, Array]]) -> dict[str, Array]:
         """Return the arrays of a part: those kept, else those that `make` returns, which are then kept."""
         found = kept_arrays(self.path(key))
         if found is None:
@@ -61,14 +61,14 @@ def remove_kept(folder: Path) -> None:
     shutil.rmtree(folder, ignore_errors=True)
 
 
-def keep_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+def keep_arrays(path: Path, arrays: Mapping[str, Array]) -> None:
     """Write an .npz file with its SHA-256 behind it, which np.load passes over."""
     file, named = BytesIO(), dict[str, Any](arrays)
     np.savez_compressed(file, **named)
     write_atomic(path, file.getvalue() + sha256(file.getvalue()).digest())
 
 
-def kept_arrays(path: Path) -> dict[str, NDArray[Any]] | None:
+def kept_arrays(path: Path) -> dict[str, Array] | None:
     """Return the arrays that `keep_arrays` wrote; None if the file is absent, damaged or not of this form."""
     try:
         content = path.read_bytes()

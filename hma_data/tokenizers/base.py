@@ -14,8 +14,8 @@ from importlib import import_module
 from typing import Any, Literal, Protocol, cast, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Array, Images
 from hma_data.episodes.images import Filter
 from hma_data.errors import MissingDependencyError, TokenizerError
 from hma_data.plugins import TOKENIZER_GROUP, installed
@@ -115,10 +115,10 @@ class Tokenizer(Protocol):
 
     spec: TokenizerSpec
 
-    def encode(self, frames: NDArray[np.uint8]) -> NDArray[Any]:
+    def encode(self, frames: Images) -> Array:
         """Encode (N, S, S, 3) uint8 RGB to (N, h, w) uint32 ids, or to (N, c, h, w) float16 latents."""
 
-    def decode(self, tokens: NDArray[Any]) -> NDArray[np.uint8]:
+    def decode(self, tokens: Array) -> Images:
         """Decode what `encode` returns to (N, S, S, 3) uint8 RGB."""
 
 
@@ -196,7 +196,7 @@ def _of_package(entry: Entry, keywords: dict[str, Any]) -> Tokenizer:
     return tokenizer
 
 
-def check_frames(frames: NDArray[Any], spec: TokenizerSpec) -> None:
+def check_frames(frames: Array, spec: TokenizerSpec) -> None:
     """Raise TokenizerError unless frames are (N, S, S, 3) uint8."""
     size = spec.image_size
     if frames.ndim != 4 or frames.shape[1:] != (size, size, 3) or frames.dtype != np.uint8:
@@ -207,7 +207,7 @@ def check_frames(frames: NDArray[Any], spec: TokenizerSpec) -> None:
         )
 
 
-def check_tokens(tokens: NDArray[Any], spec: TokenizerSpec) -> None:
+def check_tokens(tokens: Array, spec: TokenizerSpec) -> None:
     """Raise TokenizerError unless tokens have the grid of `spec`, and are ids of its vocabulary or finite."""
     kind = {"float16": np.floating, "uint8": np.uint8}.get(spec.dtype, np.integer)
     if tokens.shape[1:] != spec.cells or not np.issubdtype(tokens.dtype, kind):

@@ -10,13 +10,12 @@ Both take 256×256 images to a 16×16 grid. `di16`: 64,000 ids, finite scalar qu
 """
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from hma_data.arrays import Array
 from hma_data.errors import TokenizerError
 from hma_data.storage.kinds import one_line
 from hma_data.tokenizers.base import TokenizerSpec
@@ -50,7 +49,7 @@ def _output(made: object, shape: tuple[int, ...]) -> Tensor:
 
 def _try(tokenizer: NetworkTokenizer, files: list[Path]) -> None:
     """Encode and decode one grey image, so that programs of other tokenizers are refused at once."""
-    values: NDArray[Any] = np.full((1, IMAGE_SIZE, IMAGE_SIZE, 3), 127, np.uint8)
+    values: Array = np.full((1, IMAGE_SIZE, IMAGE_SIZE, 3), 127, np.uint8)
     for file, half in zip(files, (tokenizer.encode, tokenizer.decode), strict=True):
         try:
             values = half(values)

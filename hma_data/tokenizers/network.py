@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from hma_data.arrays import Array, Images
 from hma_data.errors import TokenizerError
 from hma_data.tokenizers.base import OTHER, TokenizerSpec, check_frames, check_tokens
 
@@ -59,7 +59,7 @@ class NetworkTokenizer:
                 parameter.data = parameter.data.contiguous(memory_format=self._format)
         self._encode, self._decode = encode, decode
 
-    def encode(self, frames: NDArray[np.uint8]) -> NDArray[Any]:
+    def encode(self, frames: Images) -> Array:
         """Encode (N, S, S, 3) uint8 RGB to (N, h, w) ids, or to (N, c, h, w) float16 latents.
 
         Raises:
@@ -69,7 +69,7 @@ class NetworkTokenizer:
         tokens = np.empty((len(frames), *self.spec.cells), self.spec.dtype)
         return self._in_batches(self._encode_batch, frames, tokens, alone=True)
 
-    def decode(self, tokens: NDArray[Any]) -> NDArray[np.uint8]:
+    def decode(self, tokens: Array) -> Images:
         """Decode what `encode` returns to (N, S, S, 3) uint8 RGB.
 
         Raises:
@@ -81,9 +81,7 @@ class NetworkTokenizer:
         frames = np.empty((len(tokens), size, size, 3), np.uint8)
         return self._in_batches(self._decode_batch, tokens, frames, alone=self.light)
 
-    def _in_batches(
-        self, step: Callable[[Any], NDArray[Any]], items: NDArray[Any], out: NDArray[Any], alone: bool
-    ) -> NDArray[Any]:
+    def _in_batches(self, step: Callable[[Any], Array], items: Array, out: Array, alone: bool) -> Array:
         """Fill `out` (N, …) with `step` of `items` (N, …), a batch at a time, and return it.
 
         With `alone`, on a CPU, several batches are computed at the same time, each on one thread.
@@ -91,7 +89,7 @@ class NetworkTokenizer:
         starts = range(0, len(items), self.batch)
         parts = [items[start : start + self.batch] for start in starts]
         if not alone or self.device.type != "cpu":
-            made: Iterable[NDArray[Any]] = map(step, parts)
+            made: Iterable[Array] = map(step, parts)
         elif len(parts) < 2:
             with one_thread():
                 made = [step(part) for part in parts]
@@ -103,7 +101,7 @@ class NetworkTokenizer:
         return out
 
     @torch.inference_mode()
-    def _encode_batch(self, frames: NDArray[np.uint8]) -> NDArray[Any]:
+    def _encode_batch(self, frames: Images) -> Array:
         """Encode at most one batch of frames; check that the spec's dtype can store the result."""
         pixels = self._padded(frames).permute(0, 3, 1, 2).float().mul_(2 / 255).sub_(1)
         pixels = pixels.to(self.dtype).contiguous(memory_format=self._format)
@@ -138,19 +136,19 @@ class NetworkTokenizer:
         """Decode ids (N, h, w) int64, or latents (N, c, h, w), to pixels (N, 3, S, S) of about [-1, 1]."""
         return self._decode(tokens)
 
-    def _decode_batch(self, tokens: NDArray[Any]) -> NDArray[np.uint8]:
+    def _decode_batch(self, tokens: Array) -> Images:
         """Decode at most one batch of ids or latents."""
         values = tokens.astype(np.int64 if self.spec.kind == "discrete" else np.float32)
-        made: NDArray[np.uint8] = self.pictures(self._moved(values)).cpu().numpy()
+        made: Images = self.pictures(self._moved(values)).cpu().numpy()
         return made
 
-    def _padded(self, part: NDArray[Any]) -> Tensor:
+    def _padded(self, part: Array) -> Tensor:
         """Return the part on the device, repeated up to a whole batch."""
         if len(part) < self.batch:
             part = np.resize(part, (self.batch, *part.shape[1:]))
         return self._moved(part)
 
-    def _moved(self, part: NDArray[Any]) -> Tensor:
+    def _moved(self, part: Array) -> Tensor:
         return torch.from_numpy(part.copy()).to(self.device)  # torch takes no negative strides
 
 

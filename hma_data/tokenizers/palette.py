@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from safetensors.numpy import save
 from torch import Tensor, nn
 
+from hma_data.arrays import Array, Images
 from hma_data.errors import TokenizerError
 from hma_data.storage.files import write_atomic
 from hma_data.tokenizers.base import TokenizerSpec
@@ -78,7 +79,7 @@ class Palette(NetworkTokenizer):
         super().__init__(spec, network, device, nearest, shown, light=True)
         self.batch = 16 if device.type == "cpu" else self.batch
 
-    def _encode_batch(self, frames: NDArray[np.uint8]) -> NDArray[Any]:
+    def _encode_batch(self, frames: Images) -> Array:
         if self.device.type != "cpu":
             return super()._encode_batch(frames)
         red, green, blue = np.moveaxis(frames >> (8 - BITS), -1, 0).astype(np.uint16)
@@ -89,7 +90,7 @@ class Palette(NetworkTokenizer):
             tokens += digits[:, row::CELL, column::CELL] * worth
         return tokens
 
-    def _decode_batch(self, tokens: NDArray[Any]) -> NDArray[np.uint8]:
+    def _decode_batch(self, tokens: Array) -> Images:
         if self.device.type != "cpu":
             return super()._decode_batch(tokens)
         size = self.spec.image_size
@@ -120,7 +121,7 @@ def write(path: Path, colors: NDArray[np.uint8]) -> None:
     write_atomic(path, save({"colors": colors}))
 
 
-def fit(films: Iterable[NDArray[np.uint8]], count: int = MOST_COLORS) -> NDArray[np.uint8]:
+def fit(films: Iterable[Images], count: int = MOST_COLORS) -> NDArray[np.uint8]:
     """Return at most `count` colours (K, 3) for films (N, S, S, 3), by k-means.
 
     Each different colour counts by the fourth root of its pixels, so that small objects keep theirs. The

@@ -4,11 +4,9 @@ Frames are stored channels first, (3, S, S) uint8, so that they have the layout 
 tokenizer's latents with one cell per pixel. A model maps them to [0, 1] with `spec.latent_scale`.
 """
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Array, Images
 from hma_data.errors import TokenizerError
 from hma_data.tokenizers.base import TokenizerSpec, check_frames, check_tokens
 
@@ -19,12 +17,12 @@ class RawTokenizer:
     def __init__(self, name: str, image_size: int) -> None:
         self.spec = TokenizerSpec.continuous(name, 1, image_size, 1, 3, latent_scale=1 / 255, dtype="uint8")
 
-    def encode(self, frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def encode(self, frames: Images) -> Images:
         """Return (N, S, S, 3) uint8 frames as (N, 3, S, S) uint8."""
         check_frames(frames, self.spec)
         return np.ascontiguousarray(frames.transpose(0, 3, 1, 2))
 
-    def decode(self, tokens: NDArray[Any]) -> NDArray[np.uint8]:
+    def decode(self, tokens: Array) -> Images:
         """Return (N, 3, S, S) uint8 tokens as (N, S, S, 3) uint8 frames."""
         check_tokens(tokens, self.spec)
         return np.ascontiguousarray(tokens.transpose(0, 2, 3, 1))

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from hma_data.arrays import Array
 from hma_data.errors import TokenizerError
 from hma_data.storage.files import file_sha256, opened_weights, read_json
 from hma_data.storage.kinds import one_line
@@ -149,7 +150,7 @@ def read_colors(path: Path) -> NDArray[np.uint8]:
         raise TokenizerError(path, "is a folder, not a file of colours", _COLORS)
     with opened_weights(path, TokenizerError) as file:
         held = file.keys()
-        colors: NDArray[Any] = file.get_tensor("colors") if "colors" in held else np.zeros(0)
+        colors: Array = file.get_tensor("colors") if "colors" in held else np.zeros(0)
     if colors.dtype != np.uint8 or colors.shape[1:] != (3,) or not 2 <= len(colors) <= MOST_COLORS:
         text = f"its colours are {colors.dtype} {colors.shape}, not uint8 (2 to {MOST_COLORS}, 3)"
         raise TokenizerError(path, text, _COLORS)

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Float32s
 from hma_data.lab.family.bodies import Body
 from hma_data.lab.family.driver import CHANCES, Driver, Reacher
 from hma_data.lab.family.look import SIZE
@@ -161,7 +161,7 @@ def episode(
     return block_demo(world, drive, round(seconds * body.hz), MOVED, seed)
 
 
-def begin(robot: str, seed: int, number: int) -> tuple[BlockTable, Callable[[], NDArray[np.float32]]]:
+def begin(robot: str, seed: int, number: int) -> tuple[BlockTable, Callable[[], Float32s]]:
     """Return the simulation of an episode at its start, and the recorder's driver."""
     world, rng = start(Body.of(robot), seed, number)
     return world, driver(world, rng)
@@ -169,7 +169,7 @@ def begin(robot: str, seed: int, number: int) -> tuple[BlockTable, Callable[[], 
 
 def driver(
     world: BlockTable, rng: np.random.Generator, drive: Driver | Reacher | None = None
-) -> Callable[[], NDArray[np.float32]]:
+) -> Callable[[], Float32s]:
     """Return the recorder's driver, which returns the next action (A,)."""
     drive = drive or Driver(world.body, world.pose, rng)
     return lambda: drive(world.pose, world.blocks, world.held >= 0).astype(np.float32)

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Floats, Images
 from hma_data.errors import UsageError
-from hma_data.lab.family.look import DARK, LIGHT, Block, Color, Floats, background, contrast, draw, vivid
+from hma_data.lab.family.look import DARK, LIGHT, Block, Color, background, contrast, draw, vivid
 from hma_data.lab.family.mechanisms import MAKERS, Axis, Mechanism, wrapped
 
 STRIDES = {10: (1, 2), 15: (3,), 20: (2, 4), 25: (5,), 30: (3, 5), 50: (5, 10)}  # rate -> model strides
@@ -32,7 +32,7 @@ class Body:
     stride: int  # control steps a model frame
     mechanism: Mechanism
     blocks: tuple[Block, ...]
-    canvas: NDArray[np.uint8]  # the background with the fixed parts, at the drawing's size
+    canvas: Images  # the background with the fixed parts, at the drawing's size
     description: str
 
     @staticmethod

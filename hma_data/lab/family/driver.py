@@ -9,8 +9,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from hma_data.arrays import Floats
 from hma_data.lab.family.bodies import Body
-from hma_data.lab.family.look import SIZE, Floats
+from hma_data.lab.family.look import SIZE
 from hma_data.lab.family.mechanisms import wrapped
 
 MANOEUVRES = ("block", "anywhere", "hold", "weave", "rest")

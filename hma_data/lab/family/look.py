@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from hma_data.arrays import Floats, Images
+
 Color = tuple[int, int, int]
 
 SIZE, SCALE, SHIFT = 128, 2, 4  # of the frame; of the drawing; its coordinates' fractional bits
@@ -60,7 +61,7 @@ def vivid(rng: np.random.Generator, against: Sequence[Color], chosen: Sequence[C
     return color
 
 
-def background(rng: np.random.Generator) -> tuple[NDArray[np.uint8], tuple[Color, Color]]:
+def background(rng: np.random.Generator) -> tuple[Images, tuple[Color, Color]]:
     """Draw a background at the drawing's size, and return it with its two extreme colours."""
     hue, dark = rng.random(), rng.random() < 0.25
     saturation = rng.uniform(0.2, 0.5) if dark else rng.uniform(0.03, 0.3)
@@ -83,7 +84,7 @@ def background(rng: np.random.Generator) -> tuple[NDArray[np.uint8], tuple[Color
     return np.rint(image).astype(np.uint8), (extremes[0], extremes[1])
 
 
-def draw(image: NDArray[np.uint8], shapes: Iterable[Shape]) -> None:
+def draw(image: Images, shapes: Iterable[Shape]) -> None:
     """Draw shapes into an image at the drawing's size, the first lowest."""
     for points, radius, color, _ in shapes:
         fixed = _fixed(points)
@@ -120,9 +121,9 @@ def box(place: Floats, angle: float, length: float, width: float) -> Floats:
     return corners
 
 
-def shrunk(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def shrunk(image: Images) -> Images:
     """Return a drawing as a frame (SIZE, SIZE, 3)."""
-    small: NDArray[np.uint8] = cv2.resize(image, (SIZE, SIZE), interpolation=cv2.INTER_AREA).astype(np.uint8)
+    small: Images = cv2.resize(image, (SIZE, SIZE), interpolation=cv2.INTER_AREA).astype(np.uint8)
     return small
 
 

@@ -15,7 +15,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from hma_data.lab.family.look import SIZE, Color, Floats, Shape, box
+from hma_data.arrays import Floats
+from hma_data.lab.family.look import SIZE, Color, Shape, box
 
 FINGER = 3.6  # half the width of a finger
 

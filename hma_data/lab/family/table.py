@@ -9,10 +9,10 @@ Lengths are px. Q axes, A actions, B blocks, P parts that push.
 import zlib
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Bools, Float32s, Floats, Images
 from hma_data.lab.family.bodies import GRIP, Body
-from hma_data.lab.family.look import SIZE, Floats, block_shapes, draw, shrunk
+from hma_data.lab.family.look import SIZE, block_shapes, draw, shrunk
 
 REACH = 8.0  # of a gripper, from its tip
 
@@ -38,7 +38,7 @@ class BlockTable:
         return {"joint_pos": self.pose}
 
     @property
-    def observed(self) -> NDArray[np.float32]:
+    def observed(self) -> Float32s:
         """Return the pose (Q,), as recorded."""
         return self.pose.astype(np.float32)
 
@@ -52,7 +52,7 @@ class BlockTable:
         """Return the middles (B, 2) of the blocks."""
         return self.blocks
 
-    def advance(self, action: Floats | NDArray[np.float32]) -> None:
+    def advance(self, action: Floats | Float32s) -> None:
         """Simulate one control step under an action (A,)."""
         before = self.body.holds(self.pose)
         self.pose = self.body.moved(self.pose, action.astype(np.float64))
@@ -60,7 +60,7 @@ class BlockTable:
             self._carry(before)
         self._push()
 
-    def picture(self) -> NDArray[np.uint8]:
+    def picture(self) -> Images:
         """Draw the table, the blocks and the body; (SIZE, SIZE, 3) RGB."""
         image = self.body.canvas.copy()
         for block, place in zip(self.body.blocks, self.blocks, strict=True):
@@ -104,7 +104,7 @@ class BlockTable:
             if deepest.max() <= 0 and not apart:
                 break
 
-    def _separate(self, free: NDArray[np.bool_]) -> bool:
+    def _separate(self, free: Bools) -> bool:
         touched = False
         for one in range(len(self.blocks)):
             for other in range(one):

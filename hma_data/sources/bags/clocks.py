@@ -13,15 +13,12 @@ so.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hma_data.episodes.episode import Floats
+from hma_data.arrays import Array, Bools, Floats, Ints
 from hma_data.errors import EpisodeError
 
-Times = NDArray[np.int64]
 SECOND_NS = 10**9
 MAX_LATE_S = 1.0  # a message that is overtaken by more was not delayed: its clock was set back
 ALWAYS_LATE_NS = SECOND_NS // 100  # lateness that threads of a recorder cause
@@ -33,7 +30,7 @@ BEHIND_S = 0.1  # of delay between exposure and receipt that cameras and network
 DAY_S = 86_400.0
 
 
-def sorted_by(times: Times, files: Times) -> NDArray[np.int64] | None:
+def sorted_by(times: Ints, files: Ints) -> Ints | None:
     """Return the order (T,) of messages by their times; None where the clock was set back.
 
     Args:
@@ -54,13 +51,13 @@ def sorted_by(times: Times, files: Times) -> NDArray[np.int64] | None:
     return None if _crowded(times, order, behind) else order
 
 
-def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def _runs(flags: Bools) -> list[tuple[int, int]]:
     """Return begin and end of each run of True."""
     edges = np.flatnonzero(np.diff(flags.astype(np.int8), prepend=0, append=0))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
-def _crowded(times: Times, order: NDArray[np.int64], behind: NDArray[np.bool_]) -> bool:
+def _crowded(times: Ints, order: Ints, behind: Bools) -> bool:
     """Check whether the messages that sorting moved come to lie closely beside others.
 
     A clock that was set back runs through the same times twice: its messages then fall between, or on, those
@@ -117,19 +114,19 @@ class MessageTimes:
     """
 
     topic: str
-    received: Times
-    stamps: Times | None
-    files: Times
+    received: Ints
+    stamps: Ints | None
+    files: Ints
 
     def __len__(self) -> int:
         return len(self.received)
 
-    def __getitem__(self, rows: NDArray[Any]) -> "MessageTimes":
+    def __getitem__(self, rows: Array) -> "MessageTimes":
         """Return the times of some messages."""
         stamps = None if self.stamps is None else self.stamps[rows]
         return MessageTimes(self.topic, self.received[rows], stamps, self.files[rows])
 
-    def by(self, clock: str) -> Times:
+    def by(self, clock: str) -> Ints:
         """Return the times (T,) by a clock."""
         return self.stamps if clock == "header" and self.stamps is not None else self.received
 
@@ -139,15 +136,15 @@ class MessageTimes:
         # Whole seconds are divided first, because 61 bits do not fit a float.
         return nanoseconds // SECOND_NS + (nanoseconds % SECOND_NS) / 1e9
 
-    def by_receipt(self) -> NDArray[np.int64]:
+    def by_receipt(self) -> Ints:
         """Return the order (T,) of receipt, even where the recorder's clock was set back."""
         return np.argsort(self.received, kind="stable")
 
-    def order(self, clock: str) -> NDArray[np.int64] | None:
+    def order(self, clock: str) -> Ints | None:
         """Return the order (T,) by a clock; None where it was set back."""
         return np.arange(len(self)) if clock == "stored" else sorted_by(self.by(clock), self.files)
 
-    def order_or_raise(self, clock: str, where: str) -> NDArray[np.int64]:
+    def order_or_raise(self, clock: str, where: str) -> Ints:
         """Return the order (T,) by a clock.
 
         Raises:

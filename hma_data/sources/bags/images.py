@@ -7,15 +7,16 @@ foxglove, in any encoding of messages; and FFMPEGPacket. T messages; H×W pixels
 import base64
 import re
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.episodes.episode import Floats, OneByOne, of_one_size
-from hma_data.episodes.images import MAX_PIXELS, FrameToRGB, Images, decode_image, image_codec, opencv
+from hma_data.arrays import Bools, Floats, Images, Indices, Ints
+from hma_data.episodes.episode import OneByOne, of_one_size
+from hma_data.episodes.images import MAX_PIXELS, FrameToRGB, decode_image, image_codec, opencv
 from hma_data.errors import EpisodeError
 from hma_data.sources.bags.bag import Bag
 from hma_data.sources.bags.container import Channel
@@ -330,7 +331,7 @@ class VideoDecoder:
     def __init__(
         self,
         codec: str,
-        keyframes: NDArray[np.bool_],
+        keyframes: Bools,
         fetch: Callable[[int], Iterator[bytes]],
         where: str,
         reorders: bool = False,
@@ -480,11 +481,11 @@ class Messages:
         channels: the channels that the last number of a place points into.
     """
 
-    def __init__(self, bag: Bag, channels: list[Channel], places: NDArray[np.int64], where: str) -> None:
+    def __init__(self, bag: Bag, channels: list[Channel], places: Ints, where: str) -> None:
         self.where = where
         self._bag, self._channels, self._places = bag, channels, places
 
-    def read(self, indices: Sequence[int] | NDArray[np.int64]) -> Iterator[object]:
+    def read(self, indices: Indices) -> Iterator[object]:
         """Yield the decoded messages of those indices, in that order."""
         rows = self._places[np.asarray(indices, np.int64)].tolist()
         places = [(file, first, second) for file, first, second, _ in rows]
@@ -501,7 +502,7 @@ class StillStream(OneByOne):
         self.timestamps = timestamps
         self._messages, self._kind, self._levels = messages, kind, levels
 
-    def each(self, indices: Sequence[int] | NDArray[np.int64], least: int = 0) -> Iterator[Images]:
+    def each(self, indices: Indices, least: int = 0) -> Iterator[Images]:
         """See episode.OneByOne."""
         where, read = self._messages.where, self._messages.read(indices)
         return of_one_size((picture(m, self._kind, where, self._levels, least) for m in read), where)
@@ -521,7 +522,7 @@ class VideoStream(OneByOne):
         self,
         timestamps: Floats,
         messages: Messages,
-        keyframes: NDArray[np.bool_],
+        keyframes: Bools,
         codec: str,
         lead: int = 0,
         reorders: bool = False,
@@ -530,7 +531,7 @@ class VideoStream(OneByOne):
         self._messages, self._count, self._lead = messages, len(keyframes), lead
         self._decoder = VideoDecoder(codec, keyframes, self._from, messages.where, reorders)
 
-    def each(self, indices: Sequence[int] | NDArray[np.int64], least: int = 0) -> Iterator[Images]:
+    def each(self, indices: Indices, least: int = 0) -> Iterator[Images]:
         """See episode.OneByOne."""
         shown = (int(index) + self._lead for index in indices)
         return of_one_size(self._decoder.each(shown), self._messages.where)

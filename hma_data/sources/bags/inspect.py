@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from hma_data.episodes.episode import Floats
+from hma_data.arrays import Floats
 from hma_data.episodes.offset import measure as measure_offset
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.bags.bag import Bag

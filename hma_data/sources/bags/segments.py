@@ -20,9 +20,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hma_data.episodes.episode import Floats
+from hma_data.arrays import Floats, Ints
 from hma_data.errors import EpisodeError
 from hma_data.registry.components import Marker, Segments
 from hma_data.registry.embodiment import Embodiment
@@ -39,7 +38,6 @@ MAX_DELAY_S = 10.0  # header stamps further from receipt than this come from ano
 KEPT_BAGS = 2
 KEPT_TABLES = 512
 TABLE = 2  # version of what is kept of a table
-Rows = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -220,7 +218,7 @@ def _at_gaps(times: Floats, begin: int, stop: int, gap_s: float | None) -> list[
     return list(pairwise([begin, *cuts.tolist(), stop]))
 
 
-def _segment(received: Rows, begin: int, stop: int) -> Segment:
+def _segment(received: Ints, begin: int, stop: int) -> Segment:
     first_ns = int(received[begin])
     skip = begin - int(np.searchsorted(received, first_ns))
     return Segment(begin, stop, first_ns, int(received[stop - 1]), skip)
@@ -262,7 +260,7 @@ class MarkerTrack:
                 message = decode(record.channel, record.data, self._where)
         self.track.add(record.channel, record.log_ns, place, message)
 
-    def moments(self) -> Rows:
+    def moments(self) -> Ints:
         """Return the indices of the messages that count, in order of receipt."""
         order = self.track.times.by_receipt()
         if self.marker.equals is None:

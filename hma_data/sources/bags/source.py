@@ -15,7 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hma_data.episodes.episode import Episode, Floats, Signal, Stream
+from hma_data.arrays import Floats
+from hma_data.episodes.episode import Episode, Signal, Stream
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.components import Camera, Component
 from hma_data.registry.embodiment import Embodiment

@@ -18,9 +18,9 @@ from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hma_data.episodes.episode import Floats, Stream
+from hma_data.arrays import Bools, Floats, Ints
+from hma_data.episodes.episode import Stream
 from hma_data.errors import EpisodeError
 from hma_data.registry.components import Component
 from hma_data.sources.bags.bag import Bag, BagPlace
@@ -210,7 +210,7 @@ class Column:
             raise EpisodeError(self._where, fault, "give the component names in the YAML, without a slice")
         self._names = self._names or names
 
-    def rows(self) -> NDArray[np.int64]:
+    def rows(self) -> Ints:
         """Return the indices of the messages that gave values.
 
         Raises:
@@ -322,11 +322,11 @@ class TopicTrack:
         stamps = np.frombuffer(self._stamp_ns, np.int64)
         return bool(len(stamps) > 1 and stamps[0] and np.all(stamps == stamps[0]))
 
-    def places(self) -> NDArray[np.int64]:
+    def places(self) -> Ints:
         """Return (T, 4): file, two numbers of the place in it, index into `channels`."""
         return np.frombuffer(self._places, np.int64).reshape(-1, 4)
 
-    def keyframes(self) -> NDArray[np.bool_] | None:
+    def keyframes(self) -> Bools | None:
         """Return (T,) whether decoding can begin at a message; None where the codec does not show it."""
         if None in self._keyframes:
             return None

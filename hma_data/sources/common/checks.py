@@ -18,9 +18,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.arrays import Array, Floats, Images, Ints
 from hma_data.episodes.align import nearest
-from hma_data.episodes.episode import Floats
-from hma_data.episodes.images import BLANK_LEVELS, Images, PictureCheck
+from hma_data.episodes.images import BLANK_LEVELS, PictureCheck
 from hma_data.episodes.movement import MovingPart
 
 Severity = Literal["error", "warn", "info"]
@@ -219,7 +219,7 @@ def skew(times: Floats, primary: Floats) -> tuple[float, float, float] | None:
 # -- columns of times whose unit is not stated
 
 
-def seconds_a_unit(values: NDArray[Any], key: str = "") -> float | None:
+def seconds_a_unit(values: Array, key: str = "") -> float | None:
     """Return the length in seconds of one unit of a column of times; None where it is not clear.
 
     The unit follows from the size of the times, from the ending of the key, or from their steps.
@@ -246,7 +246,7 @@ def is_times(key: str, shape: tuple[int, ...]) -> bool:
     return shape in ((), (1,)) and bool(TIMES.fullmatch(key.lower()))
 
 
-def seconds_of(values: NDArray[Any], key: str = "") -> NDArray[np.float64] | None:
+def seconds_of(values: Array, key: str = "") -> Floats | None:
     """Return a column of times (T,) in seconds from the earliest; None where its unit is not clear.
 
     Stamps may repeat or go back. The unit is found from the sorted, distinct stamps.
@@ -294,7 +294,7 @@ class CameraLook:
     _check: PictureCheck | None = None
     _size: tuple[int, int] = (0, 0)
 
-    def add(self, frames: Images, indices: NDArray[np.int64], again: bool = False) -> None:
+    def add(self, frames: Images, indices: Ints, again: bool = False) -> None:
         """Add images (n, H, W, 3) of one episode, and the rising indices (n,) of their frames.
 
         `again` says that they are of the same episode as the images before.
@@ -363,7 +363,7 @@ def ycbcr_share(colours: NDArray[np.uint8]) -> float | None:
     return float(given.mean())
 
 
-def choose(length: int, pairs: int, starts: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
+def choose(length: int, pairs: int, starts: Ints | None = None) -> Ints:
     """Choose frames (n,) of an episode, in runs of neighbours over its length; a single run in its middle.
 
     Args:
@@ -381,7 +381,7 @@ def choose(length: int, pairs: int, starts: NDArray[np.int64] | None = None) -> 
     return np.unique(np.minimum(firsts[:, None] + np.arange(run), length - 1))
 
 
-def runs(indices: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+def runs(indices: Ints) -> list[Ints]:
     """Divide the chosen frames into runs of neighbours, so that only one run of images is in memory."""
     return np.split(indices, np.flatnonzero(np.diff(indices) > 1) + 1)
 

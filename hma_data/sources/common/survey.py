@@ -15,11 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Array, Floats, Images, Ints
 from hma_data.episodes.align import divide_remedy
-from hma_data.episodes.episode import Floats
-from hma_data.episodes.images import Images
 from hma_data.errors import HMAError
 from hma_data.sources.common import checks
 from hma_data.sources.common.checks import CameraLook, Finding, Severity, StreamTimes, is_times, seconds_of
@@ -71,10 +69,10 @@ class Series:
         info: the key, where only reading it shows what it is.
     """
 
-    numbers: Callable[[], NDArray[Any]] | None = None
-    frames: Callable[[NDArray[np.int64]], Sequence[Images] | Images] | None = None
+    numbers: Callable[[], Array] | None = None
+    frames: Callable[[Ints], Sequence[Images] | Images] | None = None
     count: int = 0
-    starts: NDArray[np.int64] | None = None
+    starts: Ints | None = None
     codec: str | None = None
     times: Floats | None = None
     info: KeyInfo | None = None
@@ -84,8 +82,8 @@ class Series:
 class _Numbers:
     """The range of one vector over the episodes; `low` and `high` are (A,)."""
 
-    low: NDArray[Any]
-    high: NDArray[Any]
+    low: Array
+    high: Array
     rows: int = 0
     infinite: int = 0
     values: int = 0
@@ -220,12 +218,12 @@ class Survey:
             said = listed([f"{key} has {size}" for key, size in odd.items()])
             self.note(Finding("rows", "warn", f"{name}: of {length} frames, {said}", numbers=odd), name)
 
-    def numbers(self, name: str, key: str, values: NDArray[Any], begin: int = 0) -> None:
+    def numbers(self, name: str, key: str, values: Array, begin: int = 0) -> None:
         """Add a vector (T, …) of an episode, or the part of it that begins at step `begin`."""
         if values.dtype.kind not in "fiub" or not len(values):
             return
         self.made |= {"finite", "constant"}
-        flat: NDArray[Any] = values.reshape(len(values), -1)
+        flat: Array = values.reshape(len(values), -1)
         blank = np.full(flat.shape[1], np.nan)
         held = self._numbers.setdefault(key, _Numbers(blank, blank.copy()))
         if len(held.low) != flat.shape[1]:
@@ -247,9 +245,7 @@ class Survey:
         held.values += flat.size
         held.infinite += infinite
 
-    def pictures(
-        self, name: str, key: str, frames: Images, indices: NDArray[np.int64], codec: str | None
-    ) -> None:
+    def pictures(self, name: str, key: str, frames: Images, indices: Ints, codec: str | None) -> None:
         """Add some images (n, H, W, 3) of an episode's camera, and the indices of their frames."""
         self.made |= {"size", "blank", "colour"} | ({"still"} if (np.diff(indices) == 1).any() else set())
         look = self.looks.setdefault(key, CameraLook(lossless=codec not in LOSSY))
@@ -424,7 +420,7 @@ def _still(held: _Numbers) -> list[int]:
     return [int(i) for i in np.flatnonzero(held.low == held.high)] if held.rows > 1 else []
 
 
-def _finite(held: _Numbers) -> NDArray[Any]:
+def _finite(held: _Numbers) -> Array:
     """Return the smallest and largest finite number of each value."""
     ends = np.array([*held.low, *held.high])
     return ends[np.isfinite(ends)]

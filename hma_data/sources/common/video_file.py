@@ -10,7 +10,7 @@ frames and no error.
 """
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hma_data.episodes.episode import Floats, OneByOne, all_of, of_one_size
-from hma_data.episodes.images import MAX_PIXELS, FrameToRGB, Images
+from hma_data.arrays import Floats, Images, Indices, Ints
+from hma_data.episodes.episode import OneByOne, all_of, of_one_size
+from hma_data.episodes.images import MAX_PIXELS, FrameToRGB
 from hma_data.errors import EpisodeError
 from hma_data.storage.kinds import unreadable
 
@@ -54,9 +54,9 @@ class FrameTable:
     """
 
     times: Floats
-    stamps: NDArray[np.int64]
-    keys: NDArray[np.int64]
-    seek_stamps: NDArray[np.int64]
+    stamps: Ints
+    keys: Ints
+    seek_stamps: Ints
     width: int
     height: int
     codec: str
@@ -163,7 +163,7 @@ class VideoFile:
         """Return (N,) seconds by the file's own clock."""
         return self.table.times
 
-    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
+    def frames(self, indices: Indices) -> Images:
         """Return the images (n, H, W, 3) RGB uint8 of those frames; rising indices are fastest.
 
         Raises:
@@ -177,7 +177,7 @@ class VideoFile:
             )
         return all_of(self, wanted)
 
-    def each(self, indices: Sequence[int] | NDArray[np.int64], least: int = 0) -> Iterator[Images]:
+    def each(self, indices: Indices, least: int = 0) -> Iterator[Images]:
         """Yield the image (H, W, 3) of each of those frames; rising indices are fastest. See OneByOne."""
         with _explained(str(self.path)):
             yield from of_one_size(map(self._image, map(int, indices)), str(self.path))
@@ -283,12 +283,12 @@ class FilmRows(OneByOne):
         indices: of the frames in the file; all of them by default.
     """
 
-    def __init__(self, file: VideoFile, times: Floats, indices: NDArray[np.int64] | None = None) -> None:
+    def __init__(self, file: VideoFile, times: Floats, indices: Ints | None = None) -> None:
         self.timestamps = times
         self._file, self._indices = file, np.arange(len(file)) if indices is None else indices
         self.rows = len(self._indices)
 
-    def each(self, indices: Sequence[int] | NDArray[np.int64], least: int = 0) -> Iterator[Images]:
+    def each(self, indices: Indices, least: int = 0) -> Iterator[Images]:
         """See episode.OneByOne."""
         return self._file.each(self._indices[np.asarray(indices, np.int64)])
 

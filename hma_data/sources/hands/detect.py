@@ -25,14 +25,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hma_data.episodes.images import Images, opencv
+from hma_data.arrays import Array, Float32s, Floats, Images
+from hma_data.episodes.images import opencv
 from hma_data.errors import MissingDependencyError, SourceError, install_command
 from hma_data.storage.kinds import LFS, unreadable
 from hma_data.storage.paths import StrPath, as_text
-
-Floats = NDArray[np.float64]
 
 ENVIRONMENT = "HMA_HAND_MODELS"
 PALM_SIDE, HAND_SIDE = 192, 224  # pixels of each model's input
@@ -138,7 +136,7 @@ class HandNetwork:
             raise SourceError(where, fault_text, _REMEDY)
         self._input, self._outputs = given["index"], [outputs[width].pop(0) for width in widths]
 
-    def __call__(self, image: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+    def __call__(self, image: Float32s) -> list[Float32s]:
         """Return the flat outputs for an image (side, side, 3) of values 0..1."""
         self._interpreter.set_tensor(self._input, image[None])
         self._interpreter.invoke()
@@ -265,7 +263,7 @@ def choose_sides(p_right: Sequence[float]) -> list[str | None]:
     return sides
 
 
-def cut(image: Images, square: Square, size: int) -> NDArray[np.float32]:
+def cut(image: Images, square: Square, size: int) -> Float32s:
     """Cut a square out of an image as (size, size, 3) float32 in 0..1; black beyond the edge."""
     cv2: Any = opencv()
     matrix = square.to_image(size)
@@ -286,7 +284,7 @@ def palm_anchors() -> Floats:
     return np.concatenate(found)
 
 
-def decode_palms(values: NDArray[Any], scores: NDArray[Any], anchors: Floats) -> list[Floats]:
+def decode_palms(values: Array, scores: Array, anchors: Floats) -> list[Floats]:
     """Return the palms that the model found, the surest first, with overlapping ones merged.
 
     Args:

@@ -21,8 +21,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Floats
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.components import HandsLayout
 from hma_data.sources.common.pickles import load_plain
@@ -166,12 +166,12 @@ def table_labels(path: Path, layout: HandsLayout) -> LabelSet:
     return LabelSet(list(rows), of)
 
 
-def _numbers(column: Any) -> NDArray[np.float64]:
-    values: NDArray[np.float64] = column.cast("float64").to_numpy()
+def _numbers(column: Any) -> Floats:
+    values: Floats = column.cast("float64").to_numpy()
     return np.where(np.abs(values) < 1e9, values, np.nan)
 
 
-def _parts(columns: dict[str, Any], path: Path) -> dict[str, NDArray[np.float64]]:
+def _parts(columns: dict[str, Any], path: Path) -> dict[str, Floats]:
     """Return center, wrist or landmarks -> (R, 2 or 42), by the columns there are."""
     if "landmarks" in columns:
         rows = [[np.nan] * 42 if row is None else row for row in columns["landmarks"].to_pylist()]

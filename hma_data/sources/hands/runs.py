@@ -16,17 +16,14 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Array, Bools, Floats, Ints
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.components import HandsLayout
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.common.places import named_files
 from hma_data.sources.common.video_file import decoded_size, opened
 from hma_data.sources.hands import VIDEO_SUFFIXES
-
-Floats = NDArray[np.float64]
-Frames = NDArray[np.int64]
 
 SIDES = ("left", "right")
 PARTS = {"center": 2, "wrist": 2, "landmarks": 42}
@@ -113,7 +110,7 @@ def point_of(key: str, where: str) -> str:
 class HandLabels:
     """The positions of the hands in one video."""
 
-    frames: Frames  # (N,) rising indices of the labelled frames of the video
+    frames: Ints  # (N,) rising indices of the labelled frames of the video
     points: dict[str, Floats]  # point -> (N, w); NaN where there is no such hand. Every point is a key.
     pixels: bool = False  # whether values are pixels, not fractions
     irregular: bool = False  # labels are few, at any spacing; else a frame without a label has no hand
@@ -124,10 +121,10 @@ class HandLabels:
 
 
 def labels_from_rows(
-    frames: NDArray[Any],
-    sides: NDArray[Any],
-    scores: NDArray[Any],
-    parts: dict[str, NDArray[Any]],
+    frames: Array,
+    sides: Array,
+    scores: Array,
+    parts: dict[str, Array],
     looked_at: Iterable[int] = (),
     **facts: Any,
 ) -> HandLabels:
@@ -169,8 +166,8 @@ class Runs:
 
     labels: HandLabels  # as fractions, with gaps of regular labels filled in and hands held
     spans: tuple[tuple[int, int], ...]  # [from, to) into the labels; the last frame of a run only ends it
-    missing: NDArray[np.bool_]  # (N,) whether a label lacks a needed hand; held ones do not count
-    held: NDArray[np.bool_]  # (N,) whether a needed hand keeps its last position
+    missing: Bools  # (N,) whether a label lacks a needed hand; held ones do not count
+    held: Bools  # (N,) whether a needed hand keeps its last position
     counts: dict[str, int]  # numbers of frames: labelled, without_hands, outside, held, dropped
 
 
@@ -227,7 +224,7 @@ def episode_frames(labels: HandLabels, span: tuple[int, int], layout: HandsLayou
     return int(labels.frames[stop - 1] - labels.frames[start]) if every else stop - start - 1
 
 
-def find_spans(frames: Frames, there: NDArray[np.bool_], widest: int) -> list[tuple[int, int]]:
+def find_spans(frames: Ints, there: Bools, widest: int) -> list[tuple[int, int]]:
     """Return the longest stretches [from, to) of usable labels at most `widest` frames apart."""
     joined = there[1:] & there[:-1] & (np.diff(frames) <= widest)
     starts = np.flatnonzero(there & ~np.concatenate([[False], joined]))

@@ -11,7 +11,7 @@ import json
 import os
 import re
 from collections import Counter, OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -22,8 +22,8 @@ from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Array, Indices
 from hma_data.errors import EpisodeError, HMAError, SourceError
 from hma_data.sources.common.places import local_path, named_files, natural
 from hma_data.sources.common.survey import sampled
@@ -444,16 +444,16 @@ def is_plausible(found: h5py.Dataset) -> bool:
     return bool(chunk <= MAX_BYTES and np.prod(found.shape[1:], dtype=float) <= MAX_ROW)
 
 
-def numbers(group: h5py.Group, key: str, where: str) -> NDArray[Any]:
+def numbers(group: h5py.Group, key: str, where: str) -> Array:
     """Return all values (T, …) of a dataset of numbers."""
     found = dataset(group, key, where)
     if np.prod(found.shape, dtype=float) > MAX_NUMBERS:
         raise EpisodeError(where, f"{key!r} has shape {found.shape}, too large for numbers over time")
-    values: NDArray[Any] = found[()]
+    values: Array = found[()]
     return values
 
 
-def rows(found: h5py.Dataset, indices: Sequence[int] | NDArray[np.int64]) -> NDArray[Any]:
+def rows(found: h5py.Dataset, indices: Indices) -> Array:
     """Return the rows (n, …) of the given indices, in the order asked for.
 
     Neighbours are read as one slice.

@@ -10,8 +10,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_data.episodes.episode import Floats, stacked
-from hma_data.episodes.images import Images, decode_image
+from hma_data.arrays import Array, Floats, Images, Indices
+from hma_data.episodes.episode import stacked
+from hma_data.episodes.images import decode_image
 from hma_data.errors import EpisodeError
 from hma_data.registry.components import Hdf5Layout
 from hma_data.sources.hdf5.file import EpisodeFinder, EpisodeGroup, dataset, explained, rows
@@ -57,7 +58,7 @@ def pixels_of(found: h5py.Dataset, indices: Sequence[int]) -> str:
     return next((name for name, most in PIXELS.items() if high <= most and not (whole and most == 1)), "")
 
 
-def as_rgb(images: NDArray[np.uint8], axes: str | None = None) -> Images:
+def as_rgb(images: Images, axes: str | None = None) -> Images:
     """Convert (n, H, W), (n, H, W, 1|3|4) or (n, 1|3|4, H, W) to (n, H, W, 3)."""
     if images.ndim == 3:
         images = images[..., None]
@@ -91,7 +92,7 @@ def axes_of(shape: tuple[int, ...], layout: Hdf5Layout, where: str) -> str:
     return "THWC" if last else "TCHW"
 
 
-def as_bytes(images: NDArray[Any], layout: Hdf5Layout, where: str) -> NDArray[np.uint8]:
+def as_bytes(images: Array, layout: Hdf5Layout, where: str) -> Images:
     """Convert images of another number type to uint8, by the range in `layout.pixels`."""
     if images.dtype == np.uint8:
         return images
@@ -153,7 +154,7 @@ class ImageRows:
         if self._kind == "raw":
             axes_of(found.shape, layout, self._where)
 
-    def each(self, indices: Sequence[int] | NDArray[np.int64], least: int = 0) -> Images | list[Images]:
+    def each(self, indices: Indices, least: int = 0) -> Images | list[Images]:
         """Return the images of those frames, which may differ in size where each is encoded."""
         with explained(self._place):
             group, where = self._finder.group(self._place), str(self._place)
@@ -167,7 +168,7 @@ class ImageRows:
             for row, index in zip(found, indices, strict=True)
         ]
 
-    def frames(self, indices: Sequence[int] | NDArray[np.int64]) -> Images:
+    def frames(self, indices: Indices) -> Images:
         """See Stream."""
         images = self.each(indices)
         return stacked(images, len(images), self._where) if isinstance(images, list) else images

@@ -10,8 +10,8 @@ from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Array
 from hma_data.episodes.images import decode_image, image_codec
 from hma_data.errors import EpisodeError, HMAError
 from hma_data.registry.components import Hdf5Layout
@@ -167,7 +167,7 @@ def _series(
         images = ImageRows(finder, place, key, layout)
         return Series(None, images.each, recorded.of(images.rows), codec=info.codec)
 
-    def values() -> NDArray[Any]:
+    def values() -> Array:
         with explained(f"{name} {key}"):
             found = numbers(group, key, name)
         return found[: recorded.of(len(found))]

@@ -26,10 +26,10 @@ from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Float32s, Floats
 from hma_data.episodes.align import is_off_rate, measured_hz
-from hma_data.episodes.episode import Episode, Floats, Signal, Stream, rate_times
+from hma_data.episodes.episode import Episode, Signal, Stream, rate_times
 from hma_data.errors import EpisodeError, HMAError, SourceError
 from hma_data.registry.components import Hdf5Layout
 from hma_data.registry.embodiment import Embodiment
@@ -138,7 +138,7 @@ class Hdf5Source:
             check = partial(_check_length, layout, where, recorded)
             times = _times(group, embodiment, layout, recorded, where)
             check(layout.timestamps or "", len(times))
-            observed: NDArray[np.float32] | None = None
+            observed: Float32s | None = None
             if embodiment.state:
                 observed = read_vector(embodiment.state, read, where)
                 check(embodiment.state.components[0].key, len(observed))

@@ -15,10 +15,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Floats, Ints
 from hma_data.episodes.align import nearest
-from hma_data.episodes.episode import Floats
 from hma_data.errors import EpisodeError
 from hma_data.sources.common.video_file import VideoFile, frame_table
 from hma_data.sources.lerobot.metadata import Metadata, Span, episode_name
@@ -164,7 +163,7 @@ def open_video(path: Path, key: str) -> VideoFile:
 
 def frames_of_rows(
     meta: Metadata, key: str, file: VideoFile, span: Span, times: Floats, pairing: str | None
-) -> NDArray[np.int64]:
+) -> Ints:
     """Return the index of the frame that each row has.
 
     Args:

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from hma_data.episodes.episode import Floats
+from hma_data.arrays import Floats
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.lerobot.metadata import Metadata
 from hma_data.sources.lerobot.rows import Rows

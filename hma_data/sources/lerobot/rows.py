@@ -3,7 +3,7 @@
 T rows of an episode.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -13,10 +13,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
-from hma_data.episodes.episode import Floats, OneByOne, of_one_size, rate_times
-from hma_data.episodes.images import Images, decode_image, image_codec
+from hma_data.arrays import Array, Floats, Images, Indices, Ints
+from hma_data.episodes.episode import OneByOne, of_one_size, rate_times
+from hma_data.episodes.images import decode_image, image_codec
 from hma_data.errors import EpisodeError
 from hma_data.sources.lerobot.metadata import Folder, Metadata, parquet_explained
 
@@ -37,7 +37,7 @@ class Rows:
 
     path: Path
     columns: tuple[str, ...]
-    places: NDArray[np.int64]
+    places: Ints
 
     def __len__(self) -> int:
         return len(self.places)
@@ -64,7 +64,7 @@ class Rows:
         if key not in self.columns:
             raise EpisodeError(self.path, f"has no column {key!r}", f"it has {', '.join(self.columns)}")
 
-    def numbers(self, key: str) -> NDArray[Any]:
+    def numbers(self, key: str) -> Array:
         """Return a column of numbers, (T,) or (T, …).
 
         Raises:
@@ -83,7 +83,7 @@ class Rows:
             kind = values.type
             if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
                 raise EpisodeError(self.path, f"{key!r} holds {kind}, not numbers")
-            numbers: NDArray[Any] = values.to_numpy(zero_copy_only=False).reshape(shape)
+            numbers: Array = values.to_numpy(zero_copy_only=False).reshape(shape)
             return numbers
 
     def _complete(self, values: pa.Array, key: str) -> None:
@@ -228,7 +228,7 @@ class StillImages(OneByOne):
         self._rows, self._key, self._folder = rows, key, folder
         self._held: tuple[int, pa.Array] | None = None
 
-    def each(self, indices: Sequence[int] | NDArray[np.int64], least: int = 0) -> Iterator[Images]:
+    def each(self, indices: Indices, least: int = 0) -> Iterator[Images]:
         """See episode.OneByOne."""
         images = (decode_image(self._bytes(i), self._where(i), least) for i in map(int, indices))
         return of_one_size(images, f"{self._rows.path} {self._key}")

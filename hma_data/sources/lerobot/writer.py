@@ -17,9 +17,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from hma_data.arrays import Array, Float32s, Images
 from hma_data.errors import MissingDependencyError, SourceError, install_command
 from hma_data.registry.embodiment import Embodiment
 from hma_data.registry.export import lerobot_features
@@ -44,11 +42,11 @@ def origin_of(folder: Path) -> dict[str, Any]:
 class LeRobotEpisode:
     """One episode of T frames for LeRobot."""
 
-    pictures: Mapping[str, Sequence[NDArray[np.uint8]] | NDArray[np.uint8]]  # camera -> T/hold of (H, W, 3)
-    action: NDArray[np.float32]  # (T, A), the action issued at each frame
-    state: NDArray[np.float32] | None  # (T, S), seen at each frame
+    pictures: Mapping[str, Sequence[Images] | Images]  # camera -> T/hold of (H, W, 3)
+    action: Float32s  # (T, A), the action issued at each frame
+    state: Float32s | None  # (T, S), seen at each frame
     task: str  # in words
-    further: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # other features -> (T, values)
+    further: Mapping[str, Array] = field(default_factory=dict)  # other features -> (T, values)
     hold: int = 1  # rows for which an image stands
 
 

@@ -27,9 +27,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hma_data.episodes.episode import Episode, Floats, Signal
+from hma_data.arrays import Array, Floats, Ints
+from hma_data.episodes.episode import Episode, Signal
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.components import Vector
 from hma_data.registry.embodiment import Embodiment
@@ -110,7 +110,7 @@ class Scene:
         require_inside(path, self.folder)
         return path
 
-    def stamps(self, camera: str) -> NDArray[np.int64]:
+    def stamps(self, camera: str) -> Ints:
         """Return the times (T,) of a camera's frames in milliseconds, in the film's order.
 
         Raises:
@@ -123,7 +123,7 @@ class Scene:
             raise EpisodeError(path, "its color holds no times in whole milliseconds")
         return values.astype(np.int64)
 
-    def series(self, key: str, camera: str) -> tuple[Floats, NDArray[Any]]:
+    def series(self, key: str, camera: str) -> tuple[Floats, Array]:
         """Return the times (T,) in seconds and the values (T, A) of a key, as recorded with a camera.
 
         Args:
@@ -237,7 +237,7 @@ def _is_numeric(value: Any) -> bool:
     return isinstance(value, int | float | np.ndarray)
 
 
-def _numbers(value: Any, path: Path, key: str, lists: bool = False) -> NDArray[Any]:
+def _numbers(value: Any, path: Path, key: str, lists: bool = False) -> Array:
     """Return a sample's numbers as an array; a list inside a list, which could be huge, is refused."""
     if not isinstance(value, np.ndarray) and not _is_numeric(value):
         raise EpisodeError(path, f"{key} holds {type(value).__name__} values, not numbers")

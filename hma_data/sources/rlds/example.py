@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.arrays import Float32s, Ints
 from hma_data.errors import EpisodeError
 
 VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5  # wire types of protobuf
@@ -44,13 +45,13 @@ class Example:
         """Return the byte strings of a feature, as views into the record."""
         return self._items(name, "bytes")
 
-    def numbers(self, name: str) -> NDArray[np.float32] | NDArray[np.int64]:
+    def numbers(self, name: str) -> Float32s | Ints:
         """Return the (n,) numbers of a feature, float32 or int64 as stored."""
         if self._list(name)[0] == "float":
             return self._joined(name, "float", lambda data: data.view("<f4"))
         return self.ints(name)
 
-    def ints(self, name: str) -> NDArray[np.int64]:
+    def ints(self, name: str) -> Ints:
         """Return the (n,) integers of a feature."""
         return self._joined(name, "int", varints)
 
@@ -77,7 +78,7 @@ class Example:
             raise EpisodeError(self._where, f"{name}: {fault}") from fault
 
 
-def varints(data: NDArray[np.uint8]) -> NDArray[np.int64]:
+def varints(data: NDArray[np.uint8]) -> Ints:
     """Decode packed varints to int64, without a loop over them.
 
     Raises:

@@ -17,8 +17,8 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Array
 from hma_data.episodes.episode import Decode
 from hma_data.episodes.images import decode_image
 from hma_data.errors import EpisodeError, SourceError
@@ -151,7 +151,7 @@ class Steps:
             raise EpisodeError(name, "has no steps")
         self.count = count
 
-    def numbers(self, key: str) -> NDArray[Any]:
+    def numbers(self, key: str) -> Array:
         """Return a feature of numbers over the steps: (T, …) in its dtype."""
         feature = self.features[key]
         name, sizes = self._stored(feature)
@@ -224,7 +224,7 @@ class Steps:
             sizes.append(int(lengths[0]) if len(lengths) else 0)
         return f"{feature.name}/ragged_flat_values", sizes
 
-    def _decoded(self, feature: RldsFeature, name: str) -> NDArray[Any]:
+    def _decoded(self, feature: RldsFeature, name: str) -> Array:
         """Decode the tensors that are stored as bytes or zlib; return (n, …)."""
         blobs = self.example.blobs(name)
         shapes: Any = [feature.shape] * len(blobs)
@@ -251,7 +251,7 @@ def scalar(example: Example, feature: RldsFeature) -> Any:
     return np.asarray(values).astype(_given(feature))[0].item() if len(values) == 1 else None
 
 
-def _tensor_of(blob: memoryview, feature: RldsFeature, shape: Any, where: str) -> NDArray[Any]:
+def _tensor_of(blob: memoryview, feature: RldsFeature, shape: Any, where: str) -> Array:
     """Decode one tensor that is encoded to bytes; at most one of the sizes of `shape` is None."""
     sizes = [-1 if size is None else int(size) for size in shape]
     dtype = np.dtype(np.uint16 if feature.dtype == BFLOAT16 else feature.dtype)

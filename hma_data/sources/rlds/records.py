@@ -23,6 +23,7 @@ import google_crc32c
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.arrays import Ints
 from hma_data.errors import EpisodeError, MissingDependencyError, SourceError, install_command
 from hma_data.storage.blocks import Blocks
 from hma_data.storage.fetch import mark, said
@@ -40,8 +41,8 @@ Read = Callable[[int, int], bytes]  # (start, end) -> the bytes between them
 class RecordFraming:
     """The positions of the N records of a file."""
 
-    offsets: NDArray[np.int64]  # first byte of each record's data
-    lengths: NDArray[np.int64]  # bytes of data
+    offsets: Ints  # first byte of each record's data
+    lengths: Ints  # bytes of data
     checks: NDArray[np.uint32]  # checksums of the data as stored
     fault: str = ""  # why reading stopped after the last record; empty where the file ends there
     whole: bool = True  # whether the file was read to its end (or to `fault`)

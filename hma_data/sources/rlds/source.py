@@ -19,7 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from hma_data.episodes.episode import Episode, Floats, Pictures, Signal, rate_times
+from hma_data.arrays import Floats
+from hma_data.episodes.episode import Episode, Pictures, Signal, rate_times
 from hma_data.episodes.images import image_codec
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.components import Component, Vector

@@ -21,9 +21,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from hma_data.arrays import Array, Bools, Floats, Images, Ints
 from hma_data.episodes.movement import bounded_psnr_db, moving
 from hma_data.episodes.sheets import grid, write_png
 from hma_data.errors import MissingDependencyError, TokenizerError
@@ -32,8 +32,7 @@ from hma_data.storage.paths import StrPath, as_path
 from hma_data.tables import Table
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec
 
-Frames = NDArray[np.uint8]
-Perceptual = Callable[[Frames, Frames], NDArray[np.float64]]
+Perceptual = Callable[[Images, Images], Floats]
 Results = dict[str, dict[str, Any]]
 BATCH_FRAMES = 32
 GREY = (0.299, 0.587, 0.114)
@@ -64,14 +63,14 @@ def ssim_map(first: Tensor, second: Tensor) -> Tensor:
     )
 
 
-def psnr_db(true: Frames, made: Frames) -> NDArray[np.float64]:
+def psnr_db(true: Images, made: Images) -> Floats:
     """Return the peak signal-to-noise ratio in dB, (N, S, S, 3) uint8 -> (N,); equal frames give inf."""
     error = np.square(true.astype(np.float64) - made).mean(axis=(1, 2, 3))
     with np.errstate(divide="ignore"):
         return 10 * np.log10(255.0**2 / error)
 
 
-def ssim(true: Frames, made: Frames) -> NDArray[np.float64]:
+def ssim(true: Images, made: Images) -> Floats:
     """Return the structural similarity of each frame in grey, (N, S, S, 3) uint8 -> (N,)."""
     weights = torch.tensor(GREY, dtype=torch.float64) / 255
     first, second = ((torch.from_numpy(frames).double() @ weights)[:, None] for frames in (true, made))
@@ -106,11 +105,11 @@ def open_lpips(*, download: bool, device: str = "cpu") -> Perceptual:
         text = f"AlexNet's weights could not be downloaded: {fault}"
         raise MissingDependencyError("LPIPS", text, f"put {BACKBONE} into {cached.parent}") from fault
 
-    def pixels(frames: Frames) -> Tensor:
+    def pixels(frames: Images) -> Tensor:
         return torch.from_numpy(frames).to(device).permute(0, 3, 1, 2).float().mul(2 / 255).sub(1)
 
     @torch.inference_mode()
-    def measure(true: Frames, made: Frames) -> NDArray[np.float64]:
+    def measure(true: Images, made: Images) -> Floats:
         return np.asarray(network(pixels(true), pixels(made)).flatten().cpu().numpy(), np.float64)
 
     return measure
@@ -126,7 +125,7 @@ class CodebookUse:
         self.sizes = spec.factored or (spec.vocab_size or 1,)
         self.ids, self.counts = np.zeros((2, 0), np.int64)  # the ids in rising order
 
-    def add(self, ids: NDArray[Any]) -> None:
+    def add(self, ids: Array) -> None:
         """Count (N, h, w) ids."""
         found, counts = np.unique(ids.astype(np.int64), return_counts=True)
         self.ids, place = np.unique(np.concatenate([self.ids, found]), return_inverse=True)
@@ -139,7 +138,7 @@ class CodebookUse:
 
         For the whole id: the number of ids used, the perplexity, and the entropy in bits a token.
         """
-        digits, rest = list[NDArray[np.int64]](), self.ids
+        digits, rest = list[Ints](), self.ids
         for size in self.sizes:  # low digit first
             digits.append(np.zeros(size, np.int64))
             np.add.at(digits[-1], rest % size, self.counts)
@@ -154,7 +153,7 @@ class CodebookUse:
         }
 
 
-def _entropy_bits(counts: NDArray[np.int64]) -> float:
+def _entropy_bits(counts: Ints) -> float:
     share = counts[counts > 0] / max(1, counts.sum())
     return float(-(share * np.log2(share)).sum())
 
@@ -165,7 +164,7 @@ class LatentMoments:
     def __init__(self, spec: TokenizerSpec) -> None:
         self.scale, self.moments = spec.latent_scale, list[tuple[float, float]]()
 
-    def add(self, latents: NDArray[Any]) -> None:
+    def add(self, latents: Array) -> None:
         """Count (N, c, h, w) latents."""
         for scaled in latents.astype(np.float64) * self.scale:
             self.moments.append((scaled.mean(), np.square(scaled).mean()))
@@ -182,7 +181,7 @@ class LatentMoments:
 
 def evaluate(
     tokenizer: Tokenizer,
-    frames_iter: Iterable[Frames],
+    frames_iter: Iterable[Images],
     *,
     worst: int = 0,
     perceptual: Perceptual | None = None,
@@ -209,7 +208,7 @@ def evaluate(
     use = CodebookUse(spec) if spec.kind == "discrete" else LatentMoments(spec)
     bits = math.log2(spec.vocab_size) if spec.vocab_size else np.dtype(spec.dtype).itemsize * 8.0
     psnr, similarity, distance = list[float](), list[float](), list[float]()
-    lowest = list[tuple[float, int, Frames, Frames]]()
+    lowest = list[tuple[float, int, Images, Images]]()
     encode_s = decode_s = moving_error = 0.0
     moved = 0
     for batch, masks in _batches(frames_iter):
@@ -255,7 +254,7 @@ def evaluate(
     return result
 
 
-def _batches(frames_iter: Iterable[Frames]) -> Iterator[tuple[Frames, NDArray[np.bool_]]]:
+def _batches(frames_iter: Iterable[Images]) -> Iterator[tuple[Images, Bools]]:
     """Regroup films and single frames into batches of `BATCH_FRAMES`, beside which pixels of them move."""
     films = (item[None] if item.ndim == 3 else item for item in frames_iter)
     pairs = (pair for film in films for pair in zip(film, moving(film), strict=True))

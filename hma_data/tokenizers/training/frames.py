@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hma_data.arrays import Float32s, Images
 from hma_data.episodes.images import Filter, prepare, resize
 from hma_data.errors import EpisodeError, RecipeError, SourceError, TokenizerError
 from hma_data.sources.common.survey import sampled
@@ -31,7 +31,6 @@ from hma_data.tokenizers.training.recipe import DrawnSource, FileSource
 if TYPE_CHECKING:
     from hma_data.registry.embodiment import Embodiment
 
-Frame = NDArray[np.uint8]
 Skip = Callable[[str], object]  # is told why a file or an episode is left out
 VIDEOS = {".mp4", ".avi", ".mkv", ".webm", ".gif"}
 PICTURES = {".png", ".jpg", ".jpeg", ".webp", ".bmp"}
@@ -50,7 +49,7 @@ def films_of(
     embodiment: "Embodiment | None" = None,
     frames: int = 64,
     on_skip: Skip = str,
-) -> Iterator[Frame]:
+) -> Iterator[Images]:
     """Return an iterator over films (n, S, S, 3) of a recording, a shard set's source, images or videos.
 
     With an embodiment, the data is a recording (a path or URI). Without one, it is a shard set, whose
@@ -82,7 +81,7 @@ def read_films(
     frames: int = 64,
     resize_filter: Filter = "area",
     on_skip: Skip = str,
-) -> Iterator[Frame]:
+) -> Iterator[Images]:
     """Yield a film (n, S, S, 3) of an image, a video, or every image and video below a folder.
 
     Args:
@@ -116,7 +115,7 @@ def read_films(
         raise TokenizerError(path, f"holds no image and no video that can be decoded{skipped}", remedy)
 
 
-def read_pictures(path: Path, frames: int) -> Iterator[Frame]:
+def read_pictures(path: Path, frames: int) -> Iterator[Images]:
     """Yield the image in a file, or `frames` evenly spaced frames of a video.
 
     Raises:
@@ -145,7 +144,7 @@ def recording_films(
     *,
     frames: int = 64,
     on_skip: Skip = str,
-) -> Iterator[Frame]:
+) -> Iterator[Images]:
     """Yield films (n, S, S, 3) of a recording as a conversion would tokenize it: every camera, by the YAML.
 
     Args:
@@ -190,14 +189,14 @@ class Pool:
 
     name: str
     weight: float
-    pictures: list[list[Frame]]
+    pictures: list[list[Images]]
 
 
-def _levels(picture: Frame) -> list[Frame]:
+def _levels(picture: Images) -> list[Images]:
     """Return the image shrunk by area averaging to LARGEST, then to halves down to about 160 pixels."""
     import cv2
 
-    levels, wanted = list[Frame](), LARGEST
+    levels, wanted = list[Images](), LARGEST
     while not levels or min(picture.shape[:2]) > 160:
         height, width = picture.shape[:2]
         scale = wanted / min(height, width)
@@ -245,7 +244,7 @@ def load_pools(sources: Sequence[FileSource | DrawnSource], corpus: Path) -> tup
     return pools, digest.hexdigest()
 
 
-def draw_batch(pools: list[Pool], side: int, count: int, seed: int, step: int) -> NDArray[np.float32]:
+def draw_batch(pools: list[Pool], side: int, count: int, seed: int, step: int) -> Float32s:
     """Return the crops of a training step, (N, S, S, 3) float32 in [-1, 1]; the arguments decide them."""
     weights = np.array([pool.weight for pool in pools])
     crops = np.empty((count, side, side, 3), np.float32)
@@ -257,7 +256,7 @@ def draw_batch(pools: list[Pool], side: int, count: int, seed: int, step: int) -
     return np.clip(crops, -1, 1, out=crops)
 
 
-def _crop(levels: list[Frame], side: int, rng: np.random.Generator) -> Frame:
+def _crop(levels: list[Images], side: int, rng: np.random.Generator) -> Images:
     """Cut a square out of the image, rotate and mirror it, and scale it to `side`."""
     import cv2
 
@@ -286,7 +285,7 @@ def _crop(levels: list[Frame], side: int, rng: np.random.Generator) -> Frame:
     return np.asarray(crop, np.uint8)
 
 
-def _recolour(crop: Frame, rng: np.random.Generator) -> NDArray[np.float32]:
+def _recolour(crop: Images, rng: np.random.Generator) -> Float32s:
     """Return the crop in [-1, 1] with changed brightness, contrast and colour, with blur and noise."""
     import cv2
 
