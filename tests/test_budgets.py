@@ -16,12 +16,12 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data": (736, 4_256, 8),
     "hma_data/cli": (1_541, 10_988, 8),
     "hma_data/conversion": (4_135, 30_589, 15),
-    "hma_data/episodes": (1_706, 14_585, 9),
+    "hma_data/episodes": (1_707, 14_588, 9),
     "hma_data/hub": (517, 3_857, 3),
     "hma_data/inspection": (2_111, 19_927, 8),
     "hma_data/lab": (3_297, 29_844, 16),
     "hma_data/loading": (1_279, 10_782, 6),
-    "hma_data/registry": (1_274, 8_231, 6),
+    "hma_data/registry": (1_274, 8_232, 6),
     "hma_data/shards": (2_502, 19_281, 11),
     "hma_data/sources": (12_616, 104_626, 50),
     "hma_data/storage": (1_691, 11_068, 11),
@@ -29,7 +29,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model": (568, 3_417, 4),
     "hma_model/benchmark": (823, 7_070, 5),
     "hma_model/checkpoint": (945, 7_275, 5),
-    "hma_model/cli": (1_771, 11_481, 12),
+    "hma_model/cli": (1_770, 11_474, 12),
     "hma_model/demo": (476, 4_001, 4),
     "hma_model/evaluation": (4_500, 35_827, 24),
     "hma_model/export": (1_169, 9_247, 9),
@@ -42,10 +42,10 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/released": (809, 6_821, 4),
     "hma_model/synthetic": (1_213, 9_330, 5),
     "hma_model/training": (3_693, 30_223, 20),
-    "hma_model/worlds": (1_542, 11_886, 6),
+    "hma_model/worlds": (1_542, 11_887, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_640, 518_367
-TEST_LINES = 48_286
+PRODUCT_LINES, PRODUCT_NODES = 65_640, 518_365
+TEST_LINES = 48_289
 DOC_WORDS = 41_997
 
 

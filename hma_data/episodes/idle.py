@@ -22,7 +22,8 @@ from hma_data.registry.embodiment import Embodiment
 
 STILL = 0.005
 NOISE = 0.001
-# Action spaces whose commands are motions; in a mixed one, those in a unit a second are, and others may be.
+# Action spaces whose commands are motions; in a mixed one, those in a unit a second are, and
+# others may be; a torque moves a robot or holds it.
 MOTIONS = ("eef_delta", "joint_delta", "joint_velocity", "base_velocity")
 
 
@@ -57,7 +58,7 @@ def _is_motion(part: Component, action: Action) -> bool:
 
 def _may_be_motion(part: Component, action: Action) -> bool:
     """Return whether a command is a motion, or may be one; a switch (raw values) is none."""
-    unknown = action.space == "mixed" and part.gripper is None and part.normalize
+    unknown = action.space in ("mixed", "joint_torque") and part.gripper is None and part.normalize
     return unknown or _is_motion(part, action)
 
 

@@ -22,8 +22,8 @@ from pydantic_core import PydanticCustomError
 from hma_data.registry import FORMATS, MORE_FORMATS, known_formats
 
 Space = Literal[
-    "joint_position", "joint_velocity", "joint_delta", "eef_pose", "eef_delta", "base_velocity",
-    "hand_2d", "hand_3d", "mixed",
+    "joint_position", "joint_velocity", "joint_delta", "joint_torque", "eef_pose", "eef_delta",
+    "base_velocity", "hand_2d", "hand_3d", "mixed",
 ]  # fmt: skip
 Representation = Literal[
     "euler_xyz", "quaternion_xyzw", "quaternion_wxyz", "axis_angle", "rotation_6d", "rotation_matrix"

@@ -57,7 +57,6 @@ def try_recording(
     folder = out or Path(f"hma-try-{name}")
     if name in embedded_robots(""):  # the bundled model has another robot of this id
         name = f"my_{name}"
-    folder.mkdir(parents=True, exist_ok=True)
     shards, run, film = folder / "shards", folder / "run", folder / "film.mp4"
     cpu_seconds = round(60 * minutes * usable_cores())
     done: list[list[str]] = []
@@ -145,8 +144,8 @@ def _answer(data: str, path: Path, given: list[str]) -> None:
     from hma_data.storage.yaml_io import parse_yaml, read_yaml, write_yaml
 
     values = read_yaml(path)
-    is_rate_open = "frequency_hz" in dict(todos(values))
     answers = pairs("--answer", given, "kind=real")
+    is_rate_answered = "frequency_hz" in {**dict(todos(values)), **answers}
     for key, text in answers.items():
         _set(values, key, parse_yaml(text, f"{key}={text}", UsageError))
     open_questions = []
@@ -165,7 +164,7 @@ def _answer(data: str, path: Path, given: list[str]) -> None:
         asked = "; ".join(f"{key}: {question}" for key, question in open_questions)
         flags = " ".join(f"--answer {key}=…" for key, _ in open_questions)
         raise RegistryError(path, f"has open questions: {asked}", f"use {flags}, or edit the file")
-    rate = values["frequency_hz"] if is_rate_open and not {"stride", "target_hz"} & {*answers} else None
+    rate = values["frequency_hz"] if is_rate_answered and not {"stride", "target_hz"} & {*answers} else None
     if isinstance(rate, int | float) and 0 < rate < math.inf and "stride" not in values:
         values["target_hz"] = target_hz(rate, open_source(detect(data)).inspect(data).lengths)
     write_atomic(path, write_yaml(values))

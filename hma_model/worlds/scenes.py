@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 PROMPT_FRAMES = 4  # frames; two would show velocities, more also show what stands still
 LONGEST_WINDOW = 64  # frames of a window of a recording
-RETURNING = ("joint_velocity", "base_velocity", "joint_delta", "eef_delta")  # spaces whose rest is zero
+RETURNING = ("joint_velocity", "joint_torque", "base_velocity", "joint_delta", "eef_delta")  # zero at rest
 
 
 @dataclass(frozen=True)

@@ -79,6 +79,9 @@ def test_a_rate_that_is_answered_decides_what_the_model_sees(tmp_path: Path) -> 
     path.write_text(write_yaml({"frequency_hz": "TODO: at how many Hz?", "target_hz": 2}))
     trial._answer(str(recording), path, ["frequency_hz=24", "target_hz=4"])
     assert read_yaml(path)["target_hz"] == 4
+    path.write_text(write_yaml({"frequency_hz": 24, "target_hz": 8}))
+    trial._answer(str(recording), path, ["frequency_hz=6"])  # another answer to the same question
+    assert read_yaml(path)["target_hz"] == 2
 
 
 def test_of_a_single_episode_the_training_is_shown(tmp_path, monkeypatch) -> None:
