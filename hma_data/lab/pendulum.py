@@ -16,6 +16,7 @@ import numpy as np
 
 from hma_data.arrays import Float32s, Floats, Images
 from hma_data.lab import imported
+from hma_data.lab.family.look import direction, wrapped
 from hma_data.lab.writers import RldsEpisode, write_rlds
 
 Manoeuvre = Callable[[float, float], float]  # (angle, speed) -> torque
@@ -52,8 +53,7 @@ class Pendulum:
     @property
     def angle(self) -> float:
         """Return the angle from upright, within ±π."""
-        angle = float(self._env.state[0])
-        return (angle + np.pi) % (2 * np.pi) - np.pi
+        return float(wrapped(self._env.state[0]))
 
     @property
     def speed(self) -> float:
@@ -63,12 +63,12 @@ class Pendulum:
     @property
     def observed(self) -> Float32s:
         """Return (3,) cosine and sine of the angle, and the speed: the environment's observation."""
-        return np.array([np.cos(self.angle), np.sin(self.angle), self.speed], dtype=np.float32)
+        return np.append(direction(self.angle), self.speed).astype(np.float32)
 
     @property
     def own(self) -> Floats:
         """Return the middle (1, 2) of the rod in the frame."""
-        return SIZE / 2 - ROD * np.array([[np.sin(self.angle), np.cos(self.angle)]])
+        return SIZE / 2 - ROD * direction(self.angle)[None, ::-1]
 
     @property
     def loose(self) -> Floats:

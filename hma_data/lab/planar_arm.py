@@ -20,7 +20,7 @@ import numpy as np
 
 from hma_data.arrays import Float32s, Floats, Images
 from hma_data.lab import imported
-from hma_data.lab.family.look import SCALE, SIZE, Color, Shape, box, draw, shrunk
+from hma_data.lab.family.look import SCALE, SIZE, Color, Shape, box, direction, draw, shrunk, wrapped
 from hma_data.lab.writers import Demo, block_demo, write_hdf5
 from hma_data.registry.embodiment import find
 from hma_data.sources.lerobot.writer import LeRobotEpisode, write_lerobot
@@ -117,8 +117,7 @@ class PlanarArm:
     @property
     def angles(self) -> Floats:
         """Return the (J,) angles; the shoulder's is within ±π."""
-        shoulder = (self._upper.angle + np.pi) % (2 * np.pi) - np.pi
-        return np.array([shoulder, self._fore.angle - self._upper.angle])
+        return np.array([wrapped(self._upper.angle), self._fore.angle - self._upper.angle])
 
     @property
     def velocities(self) -> Floats:
@@ -179,8 +178,8 @@ class PlanarArm:
 def elbow_and_tip(joints: Floats) -> tuple[Floats, Floats]:
     """Return the positions of the elbow and the tip, (2,) each."""
     shoulder, whole = joints[0], joints[0] + joints[1]
-    elbow = BASE + UPPER * np.array([np.cos(shoulder), np.sin(shoulder)])
-    return elbow, elbow + FORE * np.array([np.cos(whole), np.sin(whole)])
+    elbow = BASE + UPPER * direction(shoulder)
+    return elbow, elbow + FORE * direction(whole)
 
 
 def link_middles(joints: Floats) -> Floats:
@@ -207,7 +206,7 @@ def start(seed: int, episode: int) -> tuple[PlanarArm, np.random.Generator]:
     blocks: list[Floats] = []
     while len(blocks) < len(BLOCK_COLORS):
         angle, far = rng.uniform(-np.pi, np.pi), rng.uniform(80, 225)
-        place = BASE + far * np.array([np.cos(angle), np.sin(angle)])
+        place = BASE + far * direction(angle)
         if np.linalg.norm(taken - place, axis=1).min() > BLOCK * 0.75 + RADIUS + 8:
             blocks.append(np.array([*place, rng.uniform(-np.pi, np.pi)]))
             taken = np.concatenate([taken, place[None]])
@@ -264,7 +263,7 @@ def _rest(arm: PlanarArm) -> Floats:
 def _go(arm: PlanarArm, rng: np.random.Generator) -> Manoeuvre:
     """Return a manoeuvre that goes to a block, and through it, or to any point in reach."""
     angle, far = rng.uniform(-np.pi, np.pi), rng.uniform(60, 220)
-    point = BASE + far * np.array([np.cos(angle), np.sin(angle)])
+    point = BASE + far * direction(angle)
     if rng.random() < 0.6:
         _, tip = elbow_and_tip(arm.angles)
         block = arm.blocks[rng.integers(len(BLOCK_COLORS)), :2]
@@ -273,7 +272,7 @@ def _go(arm: PlanarArm, rng: np.random.Generator) -> Manoeuvre:
 
     def drive(arm: PlanarArm) -> Floats:
         error = goal - arm.angles
-        error[0] = (error[0] + np.pi) % (2 * np.pi) - np.pi
+        error[0] = wrapped(error[0])
         return gain * error
 
     return drive

@@ -19,6 +19,7 @@ from hma_data.arrays import Float32s, Floats, Ints
 from hma_data.lab import FAMILY, planar_arm, pusht
 from hma_data.lab.family.bodies import Body
 from hma_data.lab.family.driver import Driver, Reacher
+from hma_data.lab.family.look import wrapped
 from hma_data.lab.family.table import REACH, BlockTable
 from hma_data.lab.simulator import Simulation
 
@@ -178,7 +179,4 @@ class SeenPose:
                 damping *= 10
             if np.abs(step).max() < CLOSE:
                 break
-        if self._body is None:
-            return (pose + np.pi) % (2 * np.pi) - np.pi
-        turning = np.array([axis.turns for axis in self._body.axes])
-        return np.where(turning, (pose + np.pi) % (2 * np.pi) - np.pi, np.clip(pose, *self._body.limits))
+        return wrapped(pose) if self._body is None else self._body.bounded(pose)

@@ -15,8 +15,19 @@ import numpy as np
 
 from hma_data.arrays import Floats, Images
 from hma_data.errors import UsageError
-from hma_data.lab.family.look import DARK, LIGHT, Block, Color, background, contrast, draw, vivid
-from hma_data.lab.family.mechanisms import MAKERS, Axis, Mechanism, wrapped
+from hma_data.lab.family.look import (
+    DARK,
+    LIGHT,
+    Block,
+    Color,
+    background,
+    contrast,
+    direction,
+    draw,
+    vivid,
+    wrapped,
+)
+from hma_data.lab.family.mechanisms import MAKERS, Axis, Mechanism
 
 STRIDES = {10: (1, 2), 15: (3,), 20: (2, 4), 25: (5,), 30: (3, 5), 50: (5, 10)}  # rate -> model strides
 GRIP = 0.6  # opening below which a gripper holds
@@ -113,7 +124,7 @@ class Body:
         step, action = 1 / self.hz, np.clip(action, *self.ranges)
         if self.car:
             heading = pose[2] + action[1] * step
-            ahead = np.array([np.cos(heading), np.sin(heading)]) * action[0] * step
+            ahead = direction(heading) * action[0] * step
             pose = np.array([*(pose[:2] + ahead), heading])
         else:
             speed = np.array([a.speed for a in self.axes])
@@ -121,5 +132,9 @@ class Body:
             lag = np.array([a.lag or 1.0 for a in self.axes])
             velocity = np.where(follows, (action - pose) / lag, action)
             pose = pose + np.clip(velocity, -speed, speed) * step
+        return self.bounded(pose)
+
+    def bounded(self, pose: Floats) -> Floats:
+        """Return a pose (Q,) within the limits; angles that turn without end are kept within ±π."""
         turning = np.array([a.turns for a in self.axes])
         return np.where(turning, wrapped(pose), np.clip(pose, *self.limits))

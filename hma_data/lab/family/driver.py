@@ -11,8 +11,7 @@ import numpy as np
 
 from hma_data.arrays import Floats
 from hma_data.lab.family.bodies import Body
-from hma_data.lab.family.look import SIZE
-from hma_data.lab.family.mechanisms import wrapped
+from hma_data.lab.family.look import SIZE, wrapped
 
 MANOEUVRES = ("block", "anywhere", "hold", "weave", "rest")
 CHANCES = (0.27, 0.26, 0.22, 0.15, 0.1)
@@ -194,6 +193,6 @@ def steered(body: Body, pose: Floats, point: Floats) -> Floats:
     """Return the speed and turn rate of a car that goes to a point (2,)."""
     way = point - pose[:2]
     far = float(np.hypot(*way))
-    bearing = float(wrapped(np.arctan2(way[1], way[0]) - pose[2:3])[0])
+    bearing = float(wrapped(np.arctan2(way[1], way[0]) - pose[2]))
     ahead = body.commands[0].speed * min(1.0, far / 12) * max(0.25, np.cos(bearing))
     return np.array([ahead, 4.0 * bearing if far > 3 else 0.0])

@@ -6,7 +6,7 @@ the size and shrunk.
 
 import colorsys
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -104,7 +104,7 @@ def block_shapes(block: Block, place: Floats) -> list[Shape]:
         return [Shape(place[None], r, block.color)]
     if block.form == "box":
         return [Shape(box(place, block.angle, r * 0.9, r * 0.9), r, block.color)]
-    along = np.array([np.cos(block.angle), np.sin(block.angle)])
+    along = direction(block.angle)
     bar, stem = (
         box(place - along * r * 0.5, block.angle, r * 0.45, r),
         box(place + along * r * 0.3, block.angle, r * 0.7, r * 0.45),
@@ -112,9 +112,19 @@ def block_shapes(block: Block, place: Floats) -> list[Shape]:
     return [Shape(part, r, block.color) for part in (bar, stem)]
 
 
+def direction(angle: Any) -> Floats:
+    """Return the unit vectors (..., 2) at angles (...,)."""
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def wrapped(angle: Any) -> Any:
+    """Return angles within ±π."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
 def box(place: Floats, angle: float, length: float, width: float) -> Floats:
     """Return the (4, 2) corners of a box from half its length along an angle, and half its width."""
-    along = np.array([np.cos(angle), np.sin(angle)])
+    along = direction(angle)
     side = np.array([-along[1], along[0]])
     signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     corners: Floats = place + signs @ np.stack([along * length, side * width])

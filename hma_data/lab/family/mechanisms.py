@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 
 from hma_data.arrays import Floats
-from hma_data.lab.family.look import SIZE, Color, Shape, box
+from hma_data.lab.family.look import SIZE, Color, Shape, box, direction
 
 FINGER = 3.6  # half the width of a finger
 
@@ -50,7 +50,11 @@ class Mechanism(ABC):
     """The moving parts of a kind."""
 
     axes: tuple[Axis, ...]  # the Q axes of the pose
-    commands: tuple[Axis, ...]  # the A axes of the action
+
+    @property
+    def commands(self) -> tuple[Axis, ...]:
+        """Return the A axes of the action."""
+        return self.axes
 
     def fixed(self) -> list[Shape]:
         """Return the parts that never move, drawn below everything else."""
@@ -63,11 +67,6 @@ class Mechanism(ABC):
     @abstractmethod
     def tip(self, pose: Floats) -> tuple[Floats, float]:
         """Return the point (2,) that pushes or holds blocks, and its direction."""
-
-
-def wrapped(angle: Floats) -> Floats:
-    """Return angles within ±π."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def _axis(name: str, unit: str, low: float, high: float, speed: float, turns: bool = False) -> Axis:
@@ -98,7 +97,7 @@ class Arm(Mechanism):
     def points(self, pose: Floats) -> tuple[Floats, Floats]:
         """Return the (J + 1, 2) ends of the links and their (J,) directions."""
         angles = self.facing + np.cumsum(pose[: len(self.lengths)])
-        links = self.lengths[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        links = self.lengths[:, None] * direction(angles)
         return np.concatenate([self.base[None], self.base + np.cumsum(links, axis=0)]), angles
 
     def fixed(self) -> list[Shape]:
@@ -115,7 +114,7 @@ class Arm(Mechanism):
             for point, radius in zip(points[:-1], self.radii, strict=True)
         ]
         if len(pose) > len(self.lengths):
-            ahead = np.array([np.cos(angles[-1]), np.sin(angles[-1])])
+            ahead = direction(angles[-1])
             side = np.array([-ahead[1], ahead[0]]) * (FINGER + 0.6 + 8.0 * pose[-1])
             color = self.colors[len(self.lengths)]
             for root in (points[-1] + side, points[-1] - side):
@@ -125,7 +124,7 @@ class Arm(Mechanism):
 
     def tip(self, pose: Floats) -> tuple[Floats, float]:
         points, angles = self.points(pose)
-        ahead = np.array([np.cos(angles[-1]), np.sin(angles[-1])])
+        ahead = direction(angles[-1])
         beyond = 10.0 if len(pose) > len(self.lengths) else 0.0
         return points[-1] + ahead * beyond, float(angles[-1])
 
@@ -137,7 +136,7 @@ def _arm(
     edge = rng.random() < (0.15, 0.3, 0.5, 0.6)[joints - 1]
     if edge:
         facing, along = float(rng.integers(4) * np.pi / 2), rng.uniform(-12, 12)
-        inward = np.array([np.cos(facing), np.sin(facing)])
+        inward = direction(facing)
         base = SIZE / 2 - inward * 57 + inward[::-1] * along
         reach = rng.uniform(76, 90)
     else:
@@ -160,10 +159,10 @@ def _arm(
         axes = _targets(rng, axes)
     if grips:
         axes.append(replace(_axis("gripper", "", 0, 1, 0.5 / frame), target=True, lag=0.12))
-    arm = Arm(tuple(axes), (), base, facing, lengths, radii, tuple(colors[: joints + 1]), joint)
+    arm = Arm(tuple(axes), base, facing, lengths, radii, tuple(colors[: joints + 1]), joint)
     what = "joint position targets" if target else "joint velocities"
     text = f"planar arm with {joints} joint{'s' * (joints > 1)}{' and a gripper' * grips}, {what}"
-    return replace(arm, commands=arm.axes), text
+    return arm, text
 
 
 # -- mover
@@ -173,9 +172,14 @@ def _arm(
 class Mover(Mechanism):
     """A disc, square or triangle that moves in the plane."""
 
+    driven: tuple[Axis, ...]  # the axes of the action
     form: str
     radius: float
     colors: tuple[Color, ...]
+
+    @property
+    def commands(self) -> tuple[Axis, ...]:
+        return self.driven
 
     def shapes(self, pose: Floats) -> list[Shape]:
         heading, place, r = float(pose[2]) if len(pose) > 2 else -np.pi / 2, pose[:2], self.radius
@@ -185,11 +189,9 @@ class Mover(Mechanism):
         else:
             angles = heading + 2 * np.pi * (np.arange(corners) + (0.5 if corners == 4 else 0)) / corners
             far = r * (1.2 if corners == 4 else 1.35)
-            parts = [
-                Shape(place + far * np.stack([np.cos(angles), np.sin(angles)], 1), r, self.colors[0], True)
-            ]
+            parts = [Shape(place + far * direction(angles), r, self.colors[0], True)]
         if len(pose) > 2:
-            ahead = np.array([np.cos(heading), np.sin(heading)])
+            ahead = direction(heading)
             parts.append(
                 Shape(np.stack([place + ahead * r * 0.2, place + ahead * r * 0.75]), r * 0.42, self.colors[1])
             )
@@ -263,8 +265,7 @@ def _gantry(rng: np.random.Generator, frame: float, colors: list[Color], joint: 
         axes.append(_axis("hoist", "", 0, 1, rng.uniform(0.25, 0.4) / frame))
     upright, width = bool(rng.random() < 0.5), rng.uniform(4, 6)
     text = f"gantry with a trolley{' and a hoist' * hoist}, velocities"
-    pose = tuple(axes)
-    return Gantry(pose, pose, upright, width, trolley, tuple(colors[:3]), joint), text
+    return Gantry(tuple(axes), upright, width, trolley, tuple(colors[:3]), joint), text
 
 
 # -- rails
@@ -307,9 +308,9 @@ def _rails(rng: np.random.Generator, frame: float, colors: list[Color], joint: C
         _axis(f"slider_{i + 1}", "px", size[0] + 4, SIZE - size[0] - 4, speed)
         for i, speed in enumerate(speeds)
     ]
-    pose = tuple(_targets(rng, axes) if target else axes)
+    axes = _targets(rng, axes) if target else axes
     text = f"{count} sliders on rails, {'position targets' if target else 'velocities'}"
-    return Rails(pose, pose, upright, places, size, tuple(colors[:count]), joint), text
+    return Rails(tuple(axes), upright, places, size, tuple(colors[:count]), joint), text
 
 
 # -- crane
@@ -330,7 +331,7 @@ class Crane(Mechanism):
         return [Shape(self.base[None], self.width * 2.2, self.joint)]
 
     def shapes(self, pose: Floats) -> list[Shape]:
-        along = np.array([np.cos(pose[0]), np.sin(pose[0])])
+        along = direction(pose[0])
         place = self.base + along * pose[1]
         magnet = len(pose) > 2
         parts = [
@@ -350,7 +351,7 @@ class Crane(Mechanism):
         return parts
 
     def tip(self, pose: Floats) -> tuple[Floats, float]:
-        return self.base + np.array([np.cos(pose[0]), np.sin(pose[0])]) * pose[1], float(pose[0])
+        return self.base + direction(pose[0]) * pose[1], float(pose[0])
 
 
 def _crane(rng: np.random.Generator, frame: float, colors: list[Color], joint: Color) -> tuple[Crane, str]:
@@ -363,8 +364,7 @@ def _crane(rng: np.random.Generator, frame: float, colors: list[Color], joint: C
     ]
     if magnet:
         axes.append(replace(_axis("magnet", "", 0, 1, 0.6 / frame), target=True, lag=0.12))
-    pose = tuple(axes)
-    crane = Crane(pose, pose, base, length, rng.uniform(4, 5.5), trolley, tuple(colors[:4]), joint)
+    crane = Crane(tuple(axes), base, length, rng.uniform(4, 5.5), trolley, tuple(colors[:4]), joint)
     return crane, f"crane with a jib and a trolley{' and a magnet' * magnet}, velocities"
 
 

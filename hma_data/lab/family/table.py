@@ -13,6 +13,7 @@ import numpy as np
 from hma_data.arrays import Bools, Float32s, Floats, Images
 from hma_data.lab.family.bodies import GRIP, Body
 from hma_data.lab.family.look import SIZE, block_shapes, draw, shrunk
+from hma_data.lab.pusher import rotation
 
 REACH = 8.0  # of a gripper, from its tip
 
@@ -71,7 +72,7 @@ class BlockTable:
     def _carry(self, before: bool) -> None:
         """Grasp, move along or release a block; fingers stop at it."""
         tip, angle = self.body.mechanism.tip(self.pose)
-        turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        turn = rotation(-angle)
         gripper = self.body.grip == "gripper"
         if not self.body.holds(self.pose):
             self.held = -1

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hma_data.lab import family, planar_arm, pusht, truth
-from hma_data.lab.family.mechanisms import wrapped
+from hma_data.lab.family.look import wrapped
 from hma_data.lab.scripted import driver, reacher, seen_state, state_of, steerable
 from hma_data.lab.simulator import LabSimulator
 from hma_data.storage.paths import shipped
