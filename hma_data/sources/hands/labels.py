@@ -16,7 +16,6 @@ import json
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -208,10 +207,13 @@ def _epic_labels(files: dict[str, Path], layout: HandsLayout) -> LabelSet:
 
 
 def _boxes_of(path: Path, layout: HandsLayout) -> HandLabels:
+    from hma_data.sources.common.protobuf import message_class
+
     looked_at, rows = [], []
+    kind = message_class(_DETECTIONS, "hands.Frame")
     try:
         for message in load_plain(path.read_bytes()):
-            frame = _message_class().FromString(message)
+            frame = kind.FromString(message)
             index = frame.frame_number - layout.frame_offset
             looked_at.append(index)
             for hand in frame.hands:
@@ -227,27 +229,24 @@ def _boxes_of(path: Path, layout: HandsLayout) -> HandLabels:
     return labels_from_rows(frames, sides, table[:, 2], {"center": table[:, 3:]}, looked_at)
 
 
-@cache
-def _message_class() -> Any:
-    """Return the class of a frame's detections; its field numbers are those of types.proto."""
-    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory  # type: ignore[import-untyped]
-
-    kinds = descriptor_pb2.FieldDescriptorProto
-    real, whole, message = kinds.TYPE_FLOAT, kinds.TYPE_INT32, kinds.TYPE_MESSAGE
-    file = descriptor_pb2.FileDescriptorProto(name="hands.proto", package="hands", syntax="proto3")
-    fields: dict[str, list[tuple[str, int, Any, str]]] = {  # name, number, type, its message
-        "Box": [(side, i, real, "") for i, side in enumerate(("left", "top", "right", "bottom"), start=1)],
-        "Hand": [("bbox", 1, message, ".hands.Box"), ("score", 2, real, ""), ("side", 5, whole, "")],
-        "Frame": [("frame_number", 2, whole, ""), ("hands", 3, message, ".hands.Hand")],
+# the fields of EPIC-KITCHENS' types.proto that are read
+_DETECTIONS = """
+    name: "hands.proto" package: "hands" syntax: "proto3"
+    message_type {
+        name: "Box"
+        field { name: "left" number: 1 type: TYPE_FLOAT } field { name: "top" number: 2 type: TYPE_FLOAT }
+        field { name: "right" number: 3 type: TYPE_FLOAT } field { name: "bottom" number: 4 type: TYPE_FLOAT }
     }
-    for owner, listed in fields.items():
-        made = file.message_type.add(name=owner)
-        for name, number, kind, of in listed:
-            label = kinds.LABEL_REPEATED if name == "hands" else kinds.LABEL_OPTIONAL
-            made.field.add(name=name, number=number, type=kind, type_name=of or None, label=label)
-    pool = descriptor_pool.DescriptorPool()
-    pool.Add(file)
-    return message_factory.GetMessageClass(pool.FindMessageTypeByName("hands.Frame"))
+    message_type {
+        name: "Hand"
+        field { name: "bbox" number: 1 type: TYPE_MESSAGE type_name: "Box" }
+        field { name: "score" number: 2 type: TYPE_FLOAT } field { name: "side" number: 5 type: TYPE_INT32 }
+    }
+    message_type {
+        name: "Frame" field { name: "frame_number" number: 2 type: TYPE_INT32 }
+        field { name: "hands" number: 3 label: LABEL_REPEATED type: TYPE_MESSAGE type_name: "Hand" }
+    }
+"""
 
 
 # -- Ego4D

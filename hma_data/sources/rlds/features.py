@@ -167,8 +167,8 @@ class Steps:
             said = f"{name} has {values.size} values, {self.count} steps of {_printed(feature)} are expected"
             raise EpisodeError(self.name, said) from fault
 
-    def blobs(self, key: str) -> list[memoryview]:
-        """Return a feature of byte strings over the steps: T views."""
+    def blobs(self, key: str) -> list[bytes]:
+        """Return a feature of byte strings over the steps: T of them."""
         name, _ = self._stored(self.features[key])
         blobs = self.example.blobs(name)
         if len(blobs) != self.count:
@@ -179,7 +179,7 @@ class Steps:
         """Return the first text of a key; empty where the steps have none."""
         name = f"{self.features[key].name}/ragged_flat_values"
         blobs = self.example.blobs(name) if name in self.example else self.blobs(key)
-        return bytes(blobs[0]).decode(errors="replace") if blobs else ""
+        return blobs[0].decode(errors="replace") if blobs else ""
 
     def decoder(self, key: str) -> Decode:
         """Return a function that maps a step to the image (H, W, 3) of a key."""
@@ -190,9 +190,7 @@ class Steps:
         blobs = self.blobs(key)
         if feature.kind == "number":
             return lambda index, least=0: _tensor_of(blobs[index], feature, feature.shape, self.name)
-        return lambda index, least=0: decode_image(
-            np.frombuffer(blobs[index], np.uint8), f"{where}, step {index}", least
-        )
+        return lambda index, least=0: decode_image(blobs[index], f"{where}, step {index}", least)
 
     def _rows(self, feature: RldsFeature) -> int | None:
         """Return the number of steps of a feature, if it can be known without the other features."""
@@ -246,21 +244,20 @@ def scalar(example: Example, feature: RldsFeature) -> Any:
         return None
     if feature.kind == "text":
         blobs = example.blobs(feature.name)
-        return bytes(blobs[0]).decode(errors="replace") if blobs else None
+        return blobs[0].decode(errors="replace") if blobs else None
     values = example.numbers(feature.name) if feature.kind == "number" else ()
     return np.asarray(values).astype(_given(feature))[0].item() if len(values) == 1 else None
 
 
-def _tensor_of(blob: memoryview, feature: RldsFeature, shape: Any, where: str) -> Array:
+def _tensor_of(blob: bytes, feature: RldsFeature, shape: Any, where: str) -> Array:
     """Decode one tensor that is encoded to bytes; at most one of the sizes of `shape` is None."""
     sizes = [-1 if size is None else int(size) for size in shape]
     dtype = np.dtype(np.uint16 if feature.dtype == BFLOAT16 else feature.dtype)
     limit = MAX_TENSOR_BYTES if -1 in sizes else math.prod(sizes) * dtype.itemsize + 1
     try:
-        data: Any = blob
         if feature.encoding == "zlib":
-            data = zlib.decompressobj().decompress(blob, min(limit, MAX_TENSOR_BYTES))
-        values = np.frombuffer(data, dtype).reshape(sizes)
+            blob = zlib.decompressobj().decompress(blob, min(limit, MAX_TENSOR_BYTES))
+        values = np.frombuffer(blob, dtype).reshape(sizes)
     except (zlib.error, ValueError) as fault:
         raise EpisodeError(where, f"{feature.name} is not {_printed(feature)}: {fault}") from fault
     if feature.dtype == BFLOAT16:

@@ -453,7 +453,7 @@ def test_a_wrong_record_with_a_right_checksum_gives_an_episode_error_or_an_episo
 def test_any_bytes_are_an_example_or_an_error(data):
     try:
         example = Example(data, "e")
-        for name in example._lists:
+        for name in example._features:
             example.numbers(name)
     except HMAError as fault:
         assert isinstance(fault, EpisodeError)
