@@ -40,7 +40,7 @@ from hma_data.errors import (
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.schema import EpisodeRow, Footer, Refused, RowLayout, flags_text
 from hma_data.shards.stats import Stats
-from hma_data.sources.base import EpisodeRef, Expecting, Source, open_source
+from hma_data.sources.base import EpisodeRef, Expecting, Source
 from hma_data.sources.lerobot.language import to_text
 from hma_data.storage.fetch import EPISODE_WAITS_S as WAITS_S
 from hma_data.storage.fetch import disk_is_full, storage_is_away, worth_another_try
@@ -131,7 +131,12 @@ Show = Callable[[str, int, Ints], tuple[Images, Images]]
 
 
 def read_unit(
-    job: Job, unit: ShardUnit, readers: Sequence[ReadFrames], report: Report, attempt: Attempt
+    job: Job,
+    source: Source,
+    unit: ShardUnit,
+    readers: Sequence[ReadFrames],
+    report: Report,
+    attempt: Attempt,
 ) -> Iterator[tuple[int, Item]]:
     """Read the episodes of a unit once for all outputs, each as the items that `Item` names.
 
@@ -145,7 +150,6 @@ def read_unit(
     Yields:
         the number of an output, and its next item.
     """
-    source = open_source(job.embodiment.source.format)
     if isinstance(source, Expecting):
         with suppress(HMAError):  # reading raises it too, for the episode at fault
             source.expect(job.source, [ref.id for _, ref in unit.episodes])

@@ -37,6 +37,7 @@ from hma_data.cpu import usable_cores
 from hma_data.episodes.images import prepared
 from hma_data.shards.schema import Refused, RowLayout
 from hma_data.shards.writer import ShardWriter
+from hma_data.sources.base import open_source
 from hma_data.tokenizers.base import Tokenizer, get_tokenizer
 
 FRAMES_A_BATCH = 32  # decoded and tokenized together
@@ -57,8 +58,9 @@ class MakeWork:
     beside: Job | None = None
 
     def __call__(self, workers: int) -> Work:
-        """Open the output once for this worker, and return the worker's function."""
+        """Open source and output once for this worker, and return the worker's function."""
         job, beside = self.job, LeRobotOutput(self.beside) if self.beside else None
+        source = open_source(job.embodiment.source.format)
         output = self._output(beside.batch if beside else FRAMES_A_BATCH)
         threads = max(1, usable_cores() // workers) if self.tokenizer is None else None
 
@@ -68,7 +70,7 @@ class MakeWork:
             report(Tick())  # the worker's start, which may take seconds, is no part of the rate
             both = beside is not None and not beside.has(unit)
             readers = [output.frames, beside.frames] if beside and both else [output.frames]
-            items = read_unit(job, unit, readers, report, attempt)
+            items = read_unit(job, source, unit, readers, report, attempt)
             # A second attempt reads one step at a time, which shows whose fault it is.
             items = items if attempt.number else prefetch(items)
             # The shards count what is done; the dataset gives signs of life alone.

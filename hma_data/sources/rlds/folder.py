@@ -6,12 +6,11 @@ counted. Paths are of this machine or of a store.
 """
 
 import math
-import os
 import re
 from bisect import bisect_right
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from itertools import accumulate
 from pathlib import Path
 from typing import Annotated
@@ -31,7 +30,6 @@ from hma_data.storage.yaml_io import first_fault
 
 LONGEST_JSON = 64 << 20  # most bytes of a description; more is an error
 MAX_RECORDS = 1_000_000  # that a shard may state
-_roots: dict[Path, tuple[Path, tuple[int, ...]]] = {}  # folder -> the version folder below it, and `_dates`
 TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
 NUMBER = r"-(?P<shard>\d{5,})(?:-of-(?P<shards>\d{5,}))?"
 NAMED = (  # forms of file names: the suffix after the number, or before it as TFDS writes it
@@ -185,69 +183,15 @@ def episode_id(split: str, index: int) -> str:
 
 
 def open_folder(uri: str) -> RldsFolder:
-    """Open the TFDS dataset at `uri`, which is cached for the process.
-
-    The URI is a version folder, a folder above with one version, or one shard of the dataset. A local folder
-    is cached while its descriptions stay the same, a remote one for good.
+    """Open the TFDS dataset at `uri`: a version folder, a folder above with one version, or one shard.
 
     Raises:
         SourceError: there is none, or its description cannot be read.
         MissingDependencyError: the URI's file system needs a package that is not installed.
     """
-    if is_away(uri):
-        return _open_remote(uri, os.getpid())
-    path = local_path(uri).absolute()
-    root = _local_root(uri, path.parent if path.is_file() else path)
-    described = [root / name for name in ("", "features.json", "dataset_info.json")]
-    changed = tuple(item.stat().st_mtime_ns if item.exists() else 0 for item in described)
-    return _open(uri, root, path if path.is_file() else None, changed)
-
-
-@lru_cache(maxsize=64)
-def _open_remote(uri: str, pid: int) -> RldsFolder:
-    path = place(uri)
-    only = path if _lists(path) and path.is_file() else None
-    return _open(uri, _version_folder(uri, path.parent if only else path), only, ())
-
-
-def _lists(path: Path) -> bool:
-    return not isinstance(path, RemotePath) or path.lists
-
-
-def _local_root(uri: str, path: Path) -> Path:
-    """Return `_version_folder`; the thousands of shards there are not listed again for each episode.
-
-    A second dataset or version changes the date of a folder above the first. What stays unnoticed in this
-    process is a features.json that comes later into a folder that lay beside the dataset all the time.
-    """
-    root, dates = _roots.get(path, (path, ()))
-    if not (root / "features.json").is_file() or dates != _dates(path, root):
-        root = _version_folder(uri, path)
-        _roots[path] = root, _dates(path, root)
-    return root
-
-
-def _dates(path: Path, root: Path) -> tuple[int, ...]:
-    return tuple(folder.stat().st_mtime_ns for folder in (path, root.parent))
-
-
-def _version_folder(uri: str, path: Path) -> Path:
-    """Return the folder with features.json: `path`, or one at most two levels below it."""
-    if not _lists(path) or (path / "features.json").is_file():
-        return path
-    if not path.exists():
-        raise SourceError(uri, "does not exist", "check the path, or source.uri in the embodiment's YAML")
-    patterns = ("*/features.json", "*/*/features.json")
-    folders = [found.parent for pattern in patterns for found in path.glob(pattern)]
-    if len(folders) > 1:
-        names = ", ".join(sorted(folder.relative_to(path).as_posix() for folder in folders))
-        raise SourceError(uri, f"holds several datasets or versions: {names}", "give the folder of one")
-    return folders[0] if folders else path
-
-
-@lru_cache(maxsize=64)
-def _open(uri: str, root: Path, only: Path | None, changed: tuple[int, ...]) -> RldsFolder:
-    """Make the folder of `open_folder`; `only` is the one shard that the user chose."""
+    path = place(uri) if is_away(uri) else local_path(uri).absolute()
+    only = path if _lists(path) and path.is_file() else None  # the one shard that the user chose
+    root = _version_folder(uri, path.parent if only else path)
     described = _description(root / "features.json")
     if described is None:
         fault = "has no features.json, without which its records cannot be understood"
@@ -271,8 +215,26 @@ def _open(uri: str, root: Path, only: Path | None, changed: tuple[int, ...]) -> 
         remote=is_remote(root),
         name=info.name,
         version=info.version,
-        problems=() if only else tuple(problems),  # the user chose one shard: the others are not missing
+        problems=() if only else tuple(problems),  # of one shard, the others are not missing
     )
+
+
+def _lists(path: Path) -> bool:
+    return not isinstance(path, RemotePath) or path.lists
+
+
+def _version_folder(uri: str, path: Path) -> Path:
+    """Return the folder with features.json: `path`, or one at most two levels below it."""
+    if not _lists(path) or (path / "features.json").is_file():
+        return path
+    if not path.exists():
+        raise SourceError(uri, "does not exist", "check the path, or source.uri in the embodiment's YAML")
+    patterns = ("*/features.json", "*/*/features.json")
+    folders = [found.parent for pattern in patterns for found in path.glob(pattern)]
+    if len(folders) > 1:
+        names = ", ".join(sorted(folder.relative_to(path).as_posix() for folder in folders))
+        raise SourceError(uri, f"holds several datasets or versions: {names}", "give the folder of one")
+    return folders[0] if folders else path
 
 
 def _files_in(root: Path) -> list[Path]:

@@ -45,6 +45,9 @@ log = logging.getLogger(__name__)
 class RldsSource:
     """A reader of TFDS folders in the RLDS form."""
 
+    def __init__(self) -> None:
+        self._folders: dict[str, RldsFolder] = {}
+
     def episode_ids(self, uri: StrPath) -> list[str]:
         """See Source."""
         return [ref.id for ref in self.index(uri)]
@@ -59,7 +62,7 @@ class RldsSource:
             SourceError: nothing readable is there, no such split, or the embodiment's keys are not there.
         """
         uri = as_text(uri)
-        folder = open_folder(uri)
+        folder = self._open(uri, again=True)
         wanted = embodiment.source.split if embodiment else None
         if embodiment:
             _check_keys(folder, embodiment)
@@ -87,7 +90,7 @@ class RldsSource:
             SourceError: the dataset cannot be read, or the embodiment's keys are not there.
             EpisodeError: this episode is damaged, or not as features.json says.
         """
-        folder = open_folder(as_text(uri))
+        folder = self._open(as_text(uri))
         _check_keys(folder, embodiment)
         example, path = folder.example(episode_id)
         steps = Steps(example, folder.step_features, episode_id)
@@ -110,7 +113,7 @@ class RldsSource:
 
     def expect(self, uri: StrPath, episode_ids: Sequence[str]) -> None:
         """See `RldsFolder.expect`."""
-        open_folder(as_text(uri)).expect(episode_ids)
+        self._open(as_text(uri)).expect(episode_ids)
 
     def inspect(self, uri: StrPath, episodes: int = SAMPLE) -> Inspection:
         """See Source.
@@ -118,7 +121,13 @@ class RldsSource:
         Raises:
             SourceError: nothing readable there.
         """
-        return _inspect(as_text(uri), self.index(uri), episodes)
+        refs = self.index(uri)
+        return _inspect(self._open(as_text(uri)), refs, episodes)
+
+    def _open(self, uri: str, again: bool = False) -> RldsFolder:
+        if again or uri not in self._folders:
+            self._folders[uri] = open_folder(uri)
+        return self._folders[uri]
 
 
 open = RldsSource
@@ -320,13 +329,12 @@ def _metadata(folder: RldsFolder, example: Example) -> dict[str, Any]:
 # -- inspection
 
 
-def _inspect(uri: str, refs: list[EpisodeRef], episodes: int) -> Inspection:
+def _inspect(folder: RldsFolder, refs: list[EpisodeRef], episodes: int) -> Inspection:
     """Return the inspection of a folder. The lengths are those of up to 1,000 episodes or 256 MiB.
 
     Raises:
         SourceError: nothing readable there.
     """
-    folder = open_folder(uri)
     survey = Survey(len(refs))
     survey.made |= {"files", "rows"}  # a column of another length than the episode cannot be read
     for problem in folder.problems:
@@ -335,9 +343,9 @@ def _inspect(uri: str, refs: list[EpisodeRef], episodes: int) -> Inspection:
     if first is None:
         found = survey.findings(())
         why = next((one for one in reversed(found) if one.check == "files"), found[0])
-        raise SourceError(uri, f"holds no readable episode: {why}", "copy its files again")
+        raise SourceError(folder.uri, f"holds no readable episode: {why}", "copy its files again")
     keys = [_key_info(first, key, survey) for key in folder.step_features]
-    return survey.inspection("rlds", uri, keys, lengths, _facts(folder))
+    return survey.inspection("rlds", folder.uri, keys, lengths, _facts(folder))
 
 
 def _survey(
