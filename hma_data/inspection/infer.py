@@ -207,19 +207,22 @@ class _Draft:
         self.seen, self.looks = _showing(cameras(found.keys), found.findings)
         if not self.seen.keys:
             raise _lacks(found, "has no colour camera", [key for key in found.keys if key.kind == "camera"])
-        numbers = vectors(found.keys)
+        numbers, pools = vectors(found.keys), list[list[KeyInfo]]()
         if not self.timed:  # HDF5 has other arrays too: take those with one row per frame
             lengths = [key.count for key in self.seen.keys]
             length = max(set(lengths), key=lengths.count)
             self.seen = replace(self.seen, keys=tuple(key for key in self.seen.keys if key.count == length))
+            before = [key for key in numbers if key.count is not None and key.count + 1 == length]
             numbers = [key for key in numbers if key.count == length]
+            pools.append(before)  # HDF5 may have an observation after the last action
         if self.bag:
             running = tuple(key for key in self.seen.keys if infer_topics.runs(key))
             self.seen = replace(self.seen, keys=running or self.seen.keys)
         rh20t = found.format == "rh20t"  # the names of its tables, not of their values, tell what they hold
         tables = [key for key in found.keys if key.kind == "vector"]
         guesses = ACTION_GUESSES.get(found.format, STEP_GUESSES)
-        choices = (guess(tables if rh20t else numbers) for guess in guesses)
+        pools.insert(0, tables if rh20t else numbers)
+        choices = (guess(pool) for guess in guesses for pool in pools)
         self.action = next((choice for choice in choices if choice.keys), Choice())
         chosen_states = infer_topics.states if self.bag else states
         self.states = chosen_states(numbers, () if rh20t else self.action.keys)
@@ -266,6 +269,7 @@ class _Draft:
         said = self._instruction()
         source |= {"instruction": said} if said else {}
         layout = {key: facts[key] for key in ("timestamps", "pixels", "pairing") if facts.get(key)}
+        layout |= {"last_observation": "drop"} if self._drops_last() else {}
         source |= {"layout": layout} if layout else {}
         values |= {"source": source, "provenance": self._provenance()}
         taken = {key.key for key in self.used} | {said, ""}
@@ -289,6 +293,10 @@ class _Draft:
         """Check whether nobody knows the rate yet, and episodes are so short that every frame is needed."""
         lengths = self.found.lengths
         return not self._rate() and bool(lengths) and statistics.median(lengths) < 2 * FRAMES_PER_EPISODE
+
+    def _drops_last(self) -> bool:
+        """Check whether the action has a row less than the frames, so that the last frame has none."""
+        return not self.timed and self.action.keys[0].count != self.seen.keys[0].count
 
     def _commands(self) -> list[KeyInfo]:
         """Return the keys of the action as the YAML names them: of RH20T, those of the next sample."""

@@ -42,7 +42,7 @@ _COMMANDS = (
 MEASURED = _set("actual measured current feedback state states observed odom odometry")
 STATES = _set("""
     state states joint joints jointstates qpos proprio proprioception pose eef ee tcp effector tool position
-    positions pos gripper odom odometry encoder encoders xyz
+    positions pos endpose gripper odom odometry encoder encoders xyz
 """)
 MOTION = _set("velocity velocities vel vels qvel jvel twist dq qd")
 PLACE = _set("position positions pos pose poses qpos angle angles q")

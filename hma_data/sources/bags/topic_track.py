@@ -191,8 +191,8 @@ class Column:
             if picks is None:
                 return
             values = [values[i] for i in picks]
-        elif is_list(path[self._whole]):
-            self._require_names(value_names(path[self._whole - 1 :: -1], len(path[self._whole])), row)
+        else:
+            self._require_names(self._names_in(path), row)
         if not values:
             raise EpisodeError(self._where, f"{self.field.key} is empty in message {row}")
         self._width = self._width or len(values)
@@ -202,12 +202,20 @@ class Column:
         self._values.extend(values)
         self._rows.append(row)
 
+    def _names_in(self, path: list[Any]) -> tuple[str, ...]:
+        """Return the names of the values; where an index chooses one message of a list, its name."""
+        if is_list(path[self._whole]):
+            return value_names(path[self._whole - 1 :: -1], len(path[self._whole]))
+        chosen = [[found] for found, step in zip(path[1:], self.field.steps) if isinstance(step, int)]
+        return value_names([one for one in chosen if is_message_list(one)], 1)
+
     def _require_names(self, names: tuple[str, ...], row: int) -> None:
         """Raise EpisodeError if a message, maybe of another publisher, has other joints or another order."""
         if self._names and names and names != self._names:
             before, now = ", ".join(self._names), ", ".join(names)
             fault = f"{self.field.key} is of {before}, then of {now} in message {row}"
-            raise EpisodeError(self._where, fault, "give the component names in the YAML, without a slice")
+            remedy = "give the component names in the YAML, without a slice or an index"
+            raise EpisodeError(self._where, fault, remedy)
         self._names = self._names or names
 
     def rows(self) -> Ints:

@@ -337,10 +337,10 @@ class Survey:
                 skew_ms=times.skew,
             )
         if look is not None:
-            alike = list(look.sizes) == [info.shape[:2]]  # a box is of images of one size
-            info = replace(
-                info, swapped=look.swapped()[0] or None, moves_in=look.moving.box if alike else None
-            )
+            info = replace(info, swapped=look.swapped()[0] or None)
+            if len(look.sizes) == 1:  # of images of one size, which metadata may state wrong
+                shape = (*next(iter(look.sizes)), *info.shape[2:])
+                info = replace(info, shape=shape, moves_in=look.moving.box)
         return info
 
     def findings(self, keys: Sequence[KeyInfo]) -> tuple[Finding, ...]:

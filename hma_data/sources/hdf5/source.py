@@ -38,6 +38,7 @@ from hma_data.sources.common.checks import seconds_a_unit, seconds_of
 from hma_data.sources.common.places import file_fingerprint
 from hma_data.sources.common.video_file import FilmRows, VideoFile
 from hma_data.sources.hdf5.file import (
+    MAX_NUMBERS,
     TEXT_KEYS,
     WHOLE_FILE,
     EpisodeFinder,
@@ -60,6 +61,7 @@ from hma_data.sources.hdf5.videos import SUFFIXES as VIDEO_SUFFIXES
 from hma_data.sources.hdf5.videos import is_video, video_fingerprints, video_path
 from hma_data.storage.paths import StrPath, as_text
 
+TEXTS_IN_JSON = (("problem_info", "language_instruction"), ("ep_meta", "lang"))  # of LIBERO, of RoboCasa
 _SPLITS = {"train": "train"} | dict.fromkeys(("valid", "val", "validation"), "val")
 
 
@@ -250,7 +252,7 @@ def _times(
 
 
 def _instruction(group: h5py.Group, key: str | None, where: str) -> str:
-    """Return the instruction: at the YAML's key, else where robomimic and LIBERO store it."""
+    """Return the instruction: at the YAML's key, else where robomimic, LIBERO and RoboCasa store it."""
     if key and key in group.attrs:
         return text(group.attrs[key])
     if key:
@@ -262,9 +264,10 @@ def _instruction(group: h5py.Group, key: str | None, where: str) -> str:
         for name in TEXT_KEYS:
             if said := text(holder.attrs.get(name)) or _single_text(inside(holder, name), group):
                 return said
-        stated = json_of(holder, "problem_info").get("language_instruction", "")
-        if said := text("".join(map(str, stated)) if isinstance(stated, list) else stated):
-            return said
+        for name, inner in TEXTS_IN_JSON:
+            stated = json_of(holder, name).get(inner, "")
+            if said := text("".join(map(str, stated)) if isinstance(stated, list) else stated):
+                return said
     return ""
 
 
@@ -282,16 +285,21 @@ def _first_text(found: h5py.Dataset) -> str:
 def _success(group: h5py.Group) -> bool | None:
     """Return whether the episode succeeded, from its last `success` or reward; None where it is unknown.
 
-    The last `done` counts only where both are missing, because a time-out is done too.
+    Rewards count where they are 0 or 1: others grow on the way. The last `done` counts only where both are
+    missing, because a time-out is done too.
     """
     if "success" in group.attrs:
-        return bool(np.all(group.attrs["success"]))
+        stated = group.attrs["success"]
+        if said := text(stated).lower():
+            return {"true": True, "false": False}.get(said)
+        return bool(np.all(stated))
     for key in ("success", "rewards", "dones"):
         found = inside(group, key)
         if not isinstance(found, h5py.Dataset) or is_elsewhere(found, group):
             continue
-        if found.ndim == 1 and len(found) and found.dtype.kind in "fiub":
-            return bool(found[-1] > 0)
+        if found.ndim == 1 and 0 < len(found) <= MAX_NUMBERS and found.dtype.kind in "fiub":
+            values = found[()]
+            return bool(values[-1]) if np.isin(values, (0, 1)).all() else None
     return None
 
 

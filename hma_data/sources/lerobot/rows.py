@@ -211,6 +211,7 @@ def tasks_of(meta: Metadata, index: int, rows: Rows) -> list[str]:
     Where a row's number is of no task, as merges leave it, the episode's own list counts.
     """
     listed = meta.episodes[index].get("tasks")
+    listed = [listed] if isinstance(listed, str) else listed
     own = [str(task) for task in listed if task] if isinstance(listed, list) else []
     if "task_index" not in rows.columns:
         return own

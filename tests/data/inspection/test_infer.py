@@ -47,6 +47,22 @@ def test_of_a_whole_and_its_parts_one_is_the_action(tmp_path: Path) -> None:
     assert "also recorded: joint_action/vector?" in values["provenance"]["action"]
 
 
+@pytest.mark.parametrize("image", ["obs/sensor_data/base_camera/rgb", "observations"])
+def test_the_observation_after_the_last_action_does_not_hide_the_action(tmp_path: Path, image: str) -> None:
+    """As ManiSkill and Minari record."""
+    path = tmp_path / "trajectory.h5"
+    with h5py.File(path, "w") as file:
+        for episode in ("traj_0", "traj_1"):
+            file[f"{episode}/actions"] = numbers(T, 3)
+            file[f"{episode}/{image}"] = np.stack(pictures(length=T + 1))
+            if image != "observations":
+                file[f"{episode}/obs/agent/qpos"] = numbers(T + 1, 2)
+    values = inferred(path)
+    assert keys(values, "action") == ["actions"] and "action" not in values["provenance"]
+    assert values["source"]["layout"] == {"last_observation": "drop"}
+    assert len(first_clip(path, values)) == T
+
+
 # -- RLDS
 
 
@@ -380,6 +396,15 @@ def test_a_recording_without_commands_proposes_its_own_position_as_a_question(tm
 
 
 # -- LeRobot
+
+
+def test_the_size_of_frames_is_measured_whatever_info_json_states(tmp_path: Path) -> None:
+    path = make_v2(tmp_path / "set")
+    seen = [camera["size"] for camera in inferred(path)["cameras"]]
+    info = json.loads((path / "meta/info.json").read_text())
+    info["features"][CAMERA]["shape"] = [480, 640, 3]
+    (path / "meta/info.json").write_text(json.dumps(info))
+    assert [camera["size"] for camera in inferred(path)["cameras"]] == seen
 
 
 @pytest.mark.parametrize("make", [make_v2, make_v3])

@@ -67,11 +67,20 @@ def shuffled_bag(path: Path, key: str) -> Path:
     return ros2.write(path, messages)
 
 
-@pytest.mark.parametrize("key", [*MESSAGES, "/cmd.position[0:3]"])
-def test_joints_that_change_places_are_refused_without_names(key: str, tmp_path: Path) -> None:
-    path = shuffled_bag(tmp_path / "run", key.removesuffix("[0:3]"))
-    with pytest.raises(EpisodeError, match=r"is of \w+, \w+, \w+, then of .* — give the component names"):
-        SOURCE.read(str(path), "run", picked(key, 3))
+@pytest.mark.parametrize(
+    ("key", "part", "dims"),
+    [
+        *((key, "", 3) for key in MESSAGES),
+        ("/cmd.position", "[0:3]", 3),
+        ("/cmd.motors.q", "[1:3]", 2),
+        ("/cmd.motors.q", "[2]", 1),
+    ],
+)
+def test_joints_that_change_places_are_refused_without_names(key, part, dims, tmp_path: Path) -> None:
+    path = shuffled_bag(tmp_path / "run", key)
+    key = key.replace(".q", f"{part}.q") if key.endswith(".q") else key + part
+    with pytest.raises(EpisodeError, match=r"is of \w+.*, then of \w+.* — give the component names"):
+        SOURCE.read(str(path), "run", picked(key, dims))
 
 
 @pytest.mark.parametrize("key", MESSAGES)

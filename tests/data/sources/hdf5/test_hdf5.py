@@ -70,14 +70,16 @@ def test_a_folder_names_episodes_by_file(demos: Path, tmp_path: Path) -> None:
         assert source.read(str(tmp_path), episode_id, embodiment()).id == episode_id
 
 
-def test_libero_says_what_was_asked(demos: Path) -> None:
+def test_libero_and_robocasa_say_what_was_asked(demos: Path) -> None:
     with h5py.File(demos, "a") as file:
         said = {"problem_name": "x", "language_instruction": '"pick up the bowl"'}
         file["data"].attrs["problem_info"] = json.dumps(said)
         file["data/demo_1"].attrs["language_instruction"] = "pick up the cup"
+        file["data/demo_2"].attrs["ep_meta"] = json.dumps({"layout_id": 1, "lang": "open the drawer"})
     source = open_source("hdf5")
     assert source.read(str(demos), "demo_0", embodiment()).instruction == "pick up the bowl"
     assert source.read(str(demos), "demo_1", embodiment()).instruction == "pick up the cup"
+    assert source.read(str(demos), "demo_2", embodiment()).instruction == "open the drawer"
 
 
 def test_the_instruction_is_where_the_yaml_says(demos: Path) -> None:
@@ -96,9 +98,12 @@ def test_success_is_the_last_reward_then_the_last_done(demos: Path) -> None:
         file["data/demo_1/rewards"][-1] = 1
         del file["data/demo_2/rewards"]
         del file["data/demo_3/rewards"], file["data/demo_3/dones"]
+        file["data/demo_4/rewards"][:] = 0.3  # dense: it says how near the goal is
+        file["data/demo_5/rewards"][:-1] = -1  # of each step but the last
+        file["data/demo_6"].attrs["success"], file["data/demo_7"].attrs["success"] = "False", "True"
     read = open_source("hdf5").read
-    found = [read(str(demos), f"demo_{i}", embodiment()).success for i in range(4)]
-    assert found == [False, True, True, None]
+    found = [read(str(demos), f"demo_{i}", embodiment()).success for i in range(8)]
+    assert found == [False, True, True, None, None, None, False, True]
 
 
 def test_the_file_that_macos_writes_beside_each_is_no_recording(demos: Path) -> None:

@@ -264,6 +264,14 @@ def test_tasks_in_any_form_give_each_episode_its_words(tmp_path: Path, content: 
     assert instructions(folder) == [TASKS[0], TASKS[1], TASKS[0]]
 
 
+def test_the_task_of_an_episode_may_be_a_text_in_place_of_a_list(tmp_path: Path) -> None:
+    folder = make_v2(tmp_path / "v2", LENGTHS)
+    (folder / "meta/tasks.jsonl").unlink()
+    path = folder / "meta/episodes.jsonl"
+    path.write_text(path.read_text().replace("[", "").replace("]", ""))
+    assert instructions(folder) == [TASKS[0], TASKS[1], TASKS[0]]
+
+
 def test_words_may_be_numbers_of_tasks(shared: Path) -> None:  # as the annotations of GR00T are
     change_column(data(shared), "index", lambda _, row: int(row["episode_index"] == 1))
     read = open_source("lerobot").read
