@@ -15,17 +15,17 @@ ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
     "hma_data": (736, 4_256, 8),
     "hma_data/cli": (1_541, 10_988, 8),
-    "hma_data/conversion": (4_141, 30_595, 15),
+    "hma_data/conversion": (4_138, 30_563, 15),
     "hma_data/episodes": (1_707, 14_588, 9),
     "hma_data/hub": (517, 3_857, 3),
     "hma_data/inspection": (2_119, 20_051, 8),
     "hma_data/lab": (3_319, 29_459, 16),
-    "hma_data/loading": (1_279, 10_782, 6),
-    "hma_data/registry": (1_274, 8_232, 6),
-    "hma_data/shards": (2_502, 19_281, 11),
-    "hma_data/sources": (12_551, 103_383, 51),
-    "hma_data/storage": (1_691, 11_068, 11),
-    "hma_data/tokenizers": (3_466, 25_295, 18),
+    "hma_data/loading": (1_278, 10_753, 6),
+    "hma_data/registry": (1_274, 8_220, 6),
+    "hma_data/shards": (2_498, 19_207, 11),
+    "hma_data/sources": (12_551, 103_289, 51),
+    "hma_data/storage": (1_697, 11_096, 11),
+    "hma_data/tokenizers": (3_465, 25_271, 18),
     "hma_model": (568, 3_417, 4),
     "hma_model/benchmark": (823, 7_070, 5),
     "hma_model/checkpoint": (945, 7_275, 5),
@@ -44,7 +44,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_693, 30_223, 20),
     "hma_model/worlds": (1_542, 11_887, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_611, 516_867
+PRODUCT_LINES, PRODUCT_NODES = 65_608, 516_630
 TEST_LINES = 48_337
 DOC_WORDS = 41_997
 

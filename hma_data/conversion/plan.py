@@ -412,10 +412,8 @@ def bytes_a_row(layout: RowLayout) -> float:
     numbers with 4 bytes each.
     """
     spec = layout.tokenizer
-    h, w = spec.grid
+    cell: float = np.dtype(spec.dtype).itemsize
     if spec.kind == "discrete":
-        frame = h * w * math.ceil(math.log2(spec.vocab_size or 2)) / 8
-    else:
-        frame = h * w * (spec.channels or 1) * np.dtype(spec.dtype).itemsize
-    frame *= len(layout.cameras)
-    return frame + 4 * (layout.frame_stride * layout.widths["action"] + layout.widths.get("state", 0))
+        cell = math.ceil(math.log2(spec.vocab_size or 2)) / 8
+    tokens = math.prod(spec.cells) * cell * len(layout.cameras)
+    return tokens + 4 * (layout.frame_stride * layout.widths["action"] + layout.widths.get("state", 0))

@@ -8,7 +8,6 @@ out, so the same call continues an upload that was interrupted.
 commits, not files one by one.
 """
 
-import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ from typing import Protocol
 from hma_data.errors import OutputError
 from hma_data.hub.repository import Repository
 from hma_data.shards.manifest import EMBODIMENT, EPISODES, MANIFEST, QUARANTINE, SHARD_NAME, Manifest
-from hma_data.storage.files import cache_folder
+from hma_data.storage.files import cache_folder, short_sha256
 from hma_data.storage.remote import RemotePath
 
 FILES, BYTES = 50, 5 * 10**9  # largest numbers of files and bytes in a commit
@@ -132,7 +131,7 @@ class HubOutput:
     @property
     def staging(self) -> Path:
         """Return the folder of this machine from which the set is uploaded."""
-        mark = hashlib.sha256(self.uri.encode()).hexdigest()[:8]
+        mark = short_sha256(self.uri, 8)
         return cache_folder() / "staging" / f"{self.repo.replace('/', '--')}-{mark}"
 
     def prepare(self) -> bool:

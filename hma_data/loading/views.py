@@ -8,6 +8,7 @@
 n windows, T frames, V views, h·w grid, c channels.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -88,8 +89,6 @@ def by_number(windows: Ints) -> Ints:
 
 def stacked(tokens: Array, spec: TokenizerSpec, views: int) -> Array:
     """Stack the views of frames (n, T, …) along the height: (n, T, V·h, w) or (n, T, c, V·h, w)."""
-    (h, w), (samples, frames) = spec.grid, tokens.shape[:2]
-    if spec.kind == "discrete":
-        return tokens.reshape(samples, frames, views * h, w)
-    split = tokens.reshape(samples, frames, views, spec.channels or 1, h, w)
-    return split.swapaxes(2, 3).reshape(samples, frames, spec.channels or 1, views * h, w)
+    *channels, h, w = spec.cells
+    split = tokens.reshape(*tokens.shape[:2], views, math.prod(channels), h, w).swapaxes(2, 3)
+    return split.reshape(*tokens.shape[:2], *channels, views * h, w)

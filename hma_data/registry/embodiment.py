@@ -6,7 +6,6 @@ and the name under which something is published. Nothing is guessed: a YAML stat
 A action dims, K = stride * A values of an action chunk.
 """
 
-import hashlib
 import json
 import math
 import os
@@ -35,6 +34,7 @@ from hma_data.registry.components import (
     Vector,
 )
 from hma_data.registry.folders import file_id, registry_files, registry_folders
+from hma_data.storage.files import short_sha256
 from hma_data.storage.kinds import misplaced
 from hma_data.storage.paths import StrPath, as_path, as_text
 from hma_data.storage.yaml_io import Problem, parse_yaml, plain_fault, read_yaml, write_yaml
@@ -250,7 +250,7 @@ class Embodiment(SpecModel):
     def digest(self) -> str:
         """Return sixteen hex digits over the fields that decide the shards' content (no texts, no URI)."""
         content = self.model_dump(mode="json", exclude_defaults=True, include=_DECIDES)
-        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+        return short_sha256(json.dumps(content, sort_keys=True))
 
     # -- YAML
 

@@ -214,10 +214,7 @@ class ShardSet:
 
     def tokens(self, rows: Array) -> Array:
         """Reshape (N, width) values of the token column to (N, h, w) or (N, c, h, w)."""
-        h, w = self.spec.grid
-        if self.spec.kind == "discrete":
-            return rows.reshape(-1, h, w)
-        return rows.reshape(-1, self.spec.channels or 1, h, w)
+        return rows.reshape(-1, *self.spec.cells)
 
 
 @lru_cache(maxsize=64)

@@ -4,6 +4,7 @@ S = h·w tokens a frame, c channels, A values of an action. docs/format.md speci
 """
 
 import json
+import math
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -222,9 +223,7 @@ def token_column(spec: TokenizerSpec) -> tuple[str, int]:
 
     Each further camera has a column of its own, see `RowLayout.token_columns`.
     """
-    if spec.kind == "discrete":
-        return "tokens", spec.grid[0] * spec.grid[1]
-    return "latents", (spec.channels or 1) * spec.grid[0] * spec.grid[1]
+    return "tokens" if spec.kind == "discrete" else "latents", math.prod(spec.cells)
 
 
 def _vector(values: pa.DataType, width: int) -> pa.DataType:

@@ -86,7 +86,7 @@ def part_of(final: Path) -> Path:
 def upload_folder(folder: RemotePath) -> Path:
     """Return where this machine writes files that will go into a folder of a store."""
     name = f"{folder} {platform.node()}"  # a cache may be shared by machines
-    return cache_folder() / "uploads" / hashlib.sha256(name.encode()).hexdigest()[:16]
+    return cache_folder() / "uploads" / short_sha256(name)
 
 
 def remove_parts(folder: Path) -> None:
@@ -123,6 +123,12 @@ def sync_folder(path: Path) -> None:
         os.close(handle)
 
 
+def short_sha256(content: str | bytes, digits: int = 16) -> str:
+    """Return the first hex digits of the SHA-256 of a text or of bytes."""
+    data = content.encode() if isinstance(content, str) else content
+    return hashlib.sha256(data).hexdigest()[:digits]
+
+
 def file_sha256(path: Path) -> str:
     """Return the SHA-256 hex digest of a file's bytes."""
     with path.open("rb") as file:
@@ -149,7 +155,7 @@ def new_folder(folder: Path) -> Iterator[Path]:
     folder = folder.absolute()
     folder.parent.mkdir(parents=True, exist_ok=True)
     # Another machine that shares the disk may be writing it too, and its processes are not seen here.
-    own = f"{PARTIAL}{hashlib.sha256(platform.node().encode()).hexdigest()[:8]}."
+    own = f"{PARTIAL}{short_sha256(platform.node(), 8)}."
     for left in folder.parent.glob(f".{glob.escape(folder.name)}{own}*"):
         pid = left.name.rpartition(own)[2].partition(".")[0]
         needed = left.name.endswith("-old") and not folder.exists()  # killed between the two renames

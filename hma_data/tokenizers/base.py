@@ -4,7 +4,6 @@ N images, h·w grid, c channels. Images are uint8 RGB (N, S, S, 3) with S = `spe
 A module of this package makes one tokenizer or a family; `get_tokenizer` imports it on use.
 """
 
-import hashlib
 import json
 import math
 from collections.abc import Mapping
@@ -19,6 +18,7 @@ from hma_data.arrays import Array, Images
 from hma_data.episodes.images import Filter
 from hma_data.errors import MissingDependencyError, TokenizerError
 from hma_data.plugins import TOKENIZER_GROUP, installed
+from hma_data.storage.files import short_sha256
 from hma_data.storage.paths import StrPath, as_text
 from hma_data.tokenizers.catalog import CATALOG, Entry, find_entry
 
@@ -97,13 +97,12 @@ class TokenizerSpec:
     @property
     def weights_digest(self) -> str:
         """Return twelve hex digits of the SHA-256 of the weights, or of the colours; empty for neither."""
-        colors = hashlib.sha256(self.colors.encode()).hexdigest() if self.colors else ""
-        return (self.weights_sha256 or colors)[:12]
+        return self.weights_sha256[:12] or (short_sha256(self.colors, 12) if self.colors else "")
 
     @property
     def digest(self) -> str:
         """Return sixteen hex digits of the SHA-256 over all attributes."""
-        return hashlib.sha256(json.dumps(self.to_json(), sort_keys=True).encode()).hexdigest()[:16]
+        return short_sha256(json.dumps(self.to_json(), sort_keys=True))
 
 
 @runtime_checkable

@@ -9,7 +9,6 @@ A marker is a message that begins or ends an episode: `source.segments.start` an
 arrives, or when a field of it becomes a value.
 """
 
-import hashlib
 import json
 import os
 from collections.abc import Callable, Iterable
@@ -31,7 +30,7 @@ from hma_data.sources.bags.container import Recent, Record, RecordFilter
 from hma_data.sources.bags.images import STILL_IMAGE, VIDEO, image_kind
 from hma_data.sources.bags.messages import decode
 from hma_data.sources.bags.topic_track import TopicTrack, missing_topic, parse_key
-from hma_data.storage.files import cache_folder, write_atomic
+from hma_data.storage.files import cache_folder, short_sha256, write_atomic
 
 MAX_VALUES = 8  # values of a marker in an error
 MAX_DELAY_S = 10.0  # header stamps further from receipt than this come from another clock
@@ -106,7 +105,7 @@ def parted(opened: Bag, root: Path, embodiment: Embodiment, segments: Segments) 
 
 def _stored(key: Any, make: Callable[[], SegmentTable]) -> SegmentTable:
     """Return the table of a bag from this machine's cache, so that its workers read the bag once."""
-    kept = cache_folder() / "bags" / f"{hashlib.sha256(repr((TABLE, key)).encode()).hexdigest()[:32]}.json"
+    kept = cache_folder() / "bags" / f"{short_sha256(repr((TABLE, key)), 32)}.json"
     with suppress(OSError, ValueError, KeyError, TypeError):
         values = json.loads(kept.read_bytes())
         return SegmentTable(tuple(Segment(**one) for one in values.pop("segments")), **values)

@@ -29,6 +29,7 @@ import numpy as np
 from hma_data.arrays import Array, Float32s, Floats, Images
 from hma_data.episodes.images import opencv
 from hma_data.errors import MissingDependencyError, SourceError, install_command
+from hma_data.storage.files import short_sha256
 from hma_data.storage.kinds import LFS, unreadable
 from hma_data.storage.paths import StrPath, as_text
 
@@ -65,7 +66,7 @@ class HandModels:
     @property
     def digest(self) -> str:
         """Return 16 hex digits hashed from both."""
-        return hashlib.sha256(hashlib.sha256(self.palm).digest() + self.hand).hexdigest()[:16]
+        return short_sha256(hashlib.sha256(self.palm).digest() + self.hand)
 
 
 def load_models(place: StrPath | None = None) -> HandModels:

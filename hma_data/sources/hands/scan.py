@@ -6,7 +6,6 @@ the models.
 R hands found.
 """
 
-import hashlib
 from collections import Counter
 from collections.abc import Iterable
 from functools import partial
@@ -34,7 +33,7 @@ from hma_data.sources.hands.runs import (
     labels_from_rows,
     videos_of,
 )
-from hma_data.storage.files import atomic_path, cache_folder
+from hma_data.storage.files import atomic_path, cache_folder, short_sha256
 
 BATCH_FRAMES = 8  # frames decoded together: 200 MB of 4K images
 TABLE_SUFFIXES = (".csv", ".json", ".npz", ".npy", ".parquet", ".h5", ".hdf5")  # a robot's numbers, perhaps
@@ -84,7 +83,7 @@ def scan_cached(path: Path, detector: MediaPipeHands, models: HandModels, layout
 
     video = VideoFile(path)
     facts = (VERSION, file_fingerprint(path), len(video), models.digest, layout.mirrored)
-    key = hashlib.sha256(repr(facts).encode()).hexdigest()[:32]
+    key = short_sha256(repr(facts), 32)
     kept = cache_folder() / "hands" / f"{key}.parquet"
     if not kept.is_file():
         with atomic_path(kept) as part:

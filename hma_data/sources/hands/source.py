@@ -22,7 +22,6 @@ The episode's metadata and flags count the frames that are held, masked and left
 T frames of an episode.
 """
 
-import hashlib
 import os
 from pathlib import Path
 
@@ -54,6 +53,7 @@ from hma_data.sources.hands.runs import (
     videos_of,
 )
 from hma_data.sources.hands.scan import inspect_videos, scan_cached
+from hma_data.storage.files import short_sha256
 from hma_data.storage.paths import StrPath, as_text
 
 CAMERA = "video"
@@ -178,7 +178,7 @@ def _whole(video: Video, digest: str) -> EpisodeRef:
         mark = f"{file_fingerprint(video.path)} {digest}"
     except EpisodeError as fault:  # `read` raises it again
         frames, mark = 1, str(fault)
-    return EpisodeRef(video.name, max(1, frames), None, _digest(mark.encode()))
+    return EpisodeRef(video.name, max(1, frames), None, short_sha256(mark))
 
 
 def _runs_of(
@@ -192,18 +192,18 @@ def _runs_of(
         runs = cut_into_runs(found, needed, layout, header_of(video.path), str(video.path))
         mark = file_fingerprint(video.path)
     except EpisodeError as fault:
-        return [EpisodeRef(video.name, 1, None, _digest(str(fault).encode()))]
+        return [EpisodeRef(video.name, 1, None, short_sha256(str(fault)))]
     refs = []
     for number, span in enumerate(runs.spans):
         values = [runs.labels.points[point][slice(*span)].tobytes() for point in needed]
         content = [mark.encode(), runs.labels.frames[slice(*span)].tobytes(), *values]
         frames = episode_frames(runs.labels, span, layout)
-        refs.append(EpisodeRef(f"{video.name}#{number}", frames, None, _digest(*content), group=video.name))
+        refs.append(
+            EpisodeRef(
+                f"{video.name}#{number}", frames, None, short_sha256(b"".join(content)), group=video.name
+            )
+        )
     return refs
-
-
-def _digest(*parts: bytes) -> str:
-    return hashlib.sha256(b"".join(parts)).hexdigest()[:16]
 
 
 def _episode(

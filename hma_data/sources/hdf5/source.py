@@ -20,7 +20,6 @@ frames of a video file beside the HDF5 file; see `videos`.
 T frames of an episode, n of them asked for, H×W pixels, C channels.
 """
 
-import hashlib
 from functools import partial
 from typing import Any
 
@@ -59,6 +58,7 @@ from hma_data.sources.hdf5.images import ImageRows, image_kind
 from hma_data.sources.hdf5.inspect import inspect
 from hma_data.sources.hdf5.videos import SUFFIXES as VIDEO_SUFFIXES
 from hma_data.sources.hdf5.videos import is_video, video_fingerprints, video_path
+from hma_data.storage.files import short_sha256
 from hma_data.storage.paths import StrPath, as_text
 
 TEXTS_IN_JSON = (("problem_info", "language_instruction"), ("ep_meta", "lang"))  # of LIBERO, of RoboCasa
@@ -115,7 +115,7 @@ class Hdf5Source:
                 if chosen and name not in masks.get(chosen, ()):
                     continue
                 split = None if chosen else _split_of(name, masks)
-                digest = hashlib.sha256(f"{fingerprint}{films} {place.group}".encode()).hexdigest()[:16]
+                digest = short_sha256(f"{fingerprint}{films} {place.group}")
                 refs.append(EpisodeRef(episode_id, self._length(place, embodiment), split, digest))
         if chosen and chosen not in known:
             said = ", ".join(sorted(known)) or "none"

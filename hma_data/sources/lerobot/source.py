@@ -38,6 +38,7 @@ from hma_data.sources.lerobot.films import BY_INDEX, Fit, fit_of, frames_of_rows
 from hma_data.sources.lerobot.language import language_of
 from hma_data.sources.lerobot.metadata import Feature, Folder, Metadata, episode_name
 from hma_data.sources.lerobot.rows import Rows, StillImages, rows_of, tasks_of, times_of
+from hma_data.storage.files import short_sha256
 from hma_data.storage.paths import StrPath, as_text
 
 NO_TASK = "episodes_without_task"
@@ -187,7 +188,7 @@ def _fingerprint(meta: Metadata, index: int, samples: dict[str, str]) -> str:
             parts.append(samples[relative])
     except EpisodeError as fault:  # `read` raises it again
         parts.append(str(fault))
-    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+    return short_sha256("\n".join(parts))
 
 
 def _video_sample(path: Path) -> str:

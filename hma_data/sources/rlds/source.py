@@ -7,7 +7,6 @@ and its index in the split (`train/000012`). Numbers are decoded when an episode
 T steps.
 """
 
-import hashlib
 import logging
 import math
 from collections.abc import Iterable, Sequence
@@ -32,6 +31,7 @@ from hma_data.sources.rlds.example import Example
 from hma_data.sources.rlds.features import RldsFeature, Steps, scalar
 from hma_data.sources.rlds.folder import RldsFolder, Shard, episode_id, open_folder
 from hma_data.sources.rlds.records import remote_state
+from hma_data.storage.files import short_sha256
 from hma_data.storage.paths import StrPath, as_text
 
 SAMPLED_SHARDS, SAMPLED_REMOTE = 16, 2  # shards whose first record is read to estimate lengths
@@ -148,7 +148,7 @@ def _refs(split: str, shard: Shard, own: str | None, rate: float) -> list[Episod
 def _remote_refs(split: str, shard: Shard, own: str | None, rate: float) -> list[EpisodeRef]:
     """Return the episodes of a remote shard from its size and mark alone; no record is read."""
     size, state = remote_state(shard.path)
-    fingerprint = hashlib.sha256(state.encode()).hexdigest()[:24]
+    fingerprint = short_sha256(state, 24)
     records = shard.stated or 1
     frames = max(1, round(rate * size / records))
     ids = (episode_id(split, shard.first + position) for position in range(records))
