@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from hma_data.errors import UsageError
 from hma_data.lab.simulator import simulated
 from hma_data.sources.lerobot.writer import SYNTHETIC
-from hma_model.arrays import Float32s, Ints
+from hma_model.arrays import Bools, Float32s, Ints
 from hma_model.checkpoint.folder import Checkpoint
 from hma_model.evaluation.recorded_state import (
     EPISODES_NEEDED,
@@ -33,7 +33,6 @@ from hma_model.worlds.images import recorded_cameras, seen_cameras
 from hma_model.worlds.world import World
 
 Observations = dict[str, Any]
-NEW_ROLLOUT = "lerobot_new_rollout"  # an option with which lerobot's evaluation begins each batch
 TOLD_EVERY_S = 20.0  # while a reader or a judge is trained
 log = logging.getLogger(__name__)
 
@@ -121,6 +120,8 @@ class LeRobotVectorEnv(WorldModelVectorEnv):
         self._task = None if judge is None else judged_task(embodiment, judge)
         self._cameras = camera_names(checkpoint, embodiment)
         self._train_reader = state_source(checkpoint, embodiment) if state else None
+        self.observations = np.zeros(self.observation_space.shape, np.uint8)
+        self.ended: Bools = np.zeros(num_envs, np.bool_)
         image = self.single_observation_space
         side = image.shape[0]
         pixels: Any = image
@@ -175,21 +176,26 @@ class LeRobotVectorEnv(WorldModelVectorEnv):
         log.warning("%s: success is that %s; the judge: %s", self.embodiment, self._task.text, judge.held_out)
         return judge
 
-    def reset(  # type: ignore[override]
+    def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start episodes, as `WorldModelVectorEnv.reset` does."""
+        """Start episodes, as `WorldModelVectorEnv.reset` does; lerobot's own options do nothing."""
         for env in self.envs:
             env.judge = self.judge
-        options = {key: value for key, value in (options or {}).items() if key != NEW_ROLLOUT}
-        _, infos = super().reset(seed=seed, options=options)
+        seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed
+        options = options or {}
         begun = np.flatnonzero(options.get("reset_mask", np.ones(self.num_envs)))
+        start = {"prompt": options.get("prompt")}
+        for i in begun:
+            own = None if seeds is None else seeds[i]
+            self.observations[i], _ = self.envs[i].reset(seed=own, options=start)
+        self.ended[begun] = False
         for facts in (self._frames, self._scores, self._success, self._truncated):
             facts[begun] = 0
         if isinstance(self.judge, StateJudge):  # of scores below 0, which distances are, 0 would be the best
             self._scores[begun] = self.judge.score(np.stack([self.envs[i].image for i in begun])[:, None])
         self._read(begun)
-        return self._seen(), infos
+        return self._seen(), {}
 
     def step(  # type: ignore[override]
         self, actions: Float32s
@@ -197,8 +203,10 @@ class LeRobotVectorEnv(WorldModelVectorEnv):
         """Send an action to each environment that goes on; those that get an image get it in one pass."""
         new = []
         rewards = np.zeros(self.num_envs)
-        for i, (seen, score, _, truncated, facts) in self.advance(np.flatnonzero(~self.ended), actions):
-            self.observations[i] = seen
+        going = np.flatnonzero(~self.ended)
+        self.dream(going, actions)
+        for i in going:
+            self.observations[i], score, _, truncated, facts = self.envs[i].step(actions[i])
             if facts["frames"] > self._frames[i]:
                 self._frames[i] = facts["frames"]
                 self._scores[i] = score

@@ -11,20 +11,19 @@ S pixels a side, V views side by side, A action dims, T images of an episode, N 
 import copy
 import os
 import warnings
-from collections.abc import Sequence
+from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from numpy.typing import NDArray
 
 from hma_data.episodes.images import resize
 from hma_data.errors import HMAError, UsageError
 from hma_data.storage.paths import StrPath
-from hma_model.arrays import Bools, Float32s, Images, Ints
+from hma_model.arrays import Float32s, Images, Ints
 from hma_model.generation.commands import OutsideRangeWarning
 from hma_model.worlds.images import Prompt
 from hma_model.worlds.prompts import read_prompt
@@ -56,14 +55,6 @@ class EpisodeJudge(Protocol):
     def begun(self) -> Judge:
         """Return the judge of one episode, which is about to begin."""
         ...
-
-
-def _known(options: dict[str, Any] | None, *keys: str) -> dict[str, Any]:
-    """Return the options of a reset; raise HMAError for one that would have no effect."""
-    options = options or {}
-    if other := next((key for key in options if key not in keys), None):
-        raise HMAError("reset", f"there is no option {other!r}", f"it takes {' and '.join(keys)}")
-    return options
 
 
 class WorldModelEnv(gymnasium.Env[Images, Float32s]):
@@ -149,13 +140,16 @@ class WorldModelEnv(gymnasium.Env[Images, Float32s]):
         self._read: dict[int | None, Prompt] = {}
         self._warned: set[str] = set()  # of what; a vector's environments share it, and the prompts
         self.session: int | None = None
+        self.made: dict[int, Images] | None = None  # of the next step, if a vector's pass has made them
         self.image: Images = np.zeros(world.image_shape, np.uint8)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Images, dict[str, Any]]:
         """Start an episode; `options["prompt"]` is what it starts from, as `read_prompt` takes it."""
-        given = _known(options, "prompt")
+        given = options or {}
+        if other := next((key for key in given if key != "prompt"), None):
+            raise HMAError("reset", f"there is no option {other!r}", "it takes prompt")
         super().reset(seed=seed)
         start = self._start(given.get("prompt"))
         drawn = int(self.np_random.integers(2**31))
@@ -172,29 +166,11 @@ class WorldModelEnv(gymnasium.Env[Images, Float32s]):
         self._chunks: list[Float32s] = []
         return self._seen(self.image), {"frames": 0}
 
-    def step(self, action: Float32s) -> tuple[Images, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Images, float, bool, bool, dict[str, Any]]:
         """Send an action, or a chunk; between chunks the last image is shown."""
-        return self.finish(self.world.step(self.take(action)))
-
-    def take(self, action: Any) -> dict[int, Float32s]:
-        """Take an action; return the session's chunk for the world once it is whole."""
-        return self.queue(self.checked(action))
-
-    def queue(self, actions: Float32s) -> dict[int, Float32s]:
-        """Take actions as `checked` returns them; return the session's chunk once it is whole."""
-        assert self.session is not None
-        self._waiting += list(actions)
-        if len(self._waiting) < self.action_spec.stride:
-            return {}
-        chunk = np.stack(self._waiting)
-        self._waiting = []
-        if self._judge is not None:
-            self._chunks.append(chunk)
-        return {self.session: chunk}
-
-    def finish(self, made: dict[int, Images]) -> tuple[Images, float, bool, bool, dict[str, Any]]:
-        """End a step with the images that a pass of the world made, perhaps none of this session."""
-        assert self.session is not None
+        made, self.made = self.made, None
+        if made is None:
+            made = self.world.step(self.queue(self.checked(action)))
         self._steps += 1
         reward = 0.0
         terminated = False
@@ -207,6 +183,18 @@ class WorldModelEnv(gymnasium.Env[Images, Float32s]):
         truncated = self.horizon is not None and self._steps >= self.horizon
         facts = {"frames": self._frames}
         return self._seen(self.image), float(reward), bool(terminated), truncated, facts
+
+    def queue(self, actions: Float32s) -> dict[int, Float32s]:
+        """Take actions as `checked` returns them; return the session's chunk once it is whole."""
+        assert self.session is not None
+        self._waiting += list(actions)
+        if len(self._waiting) < self.action_spec.stride:
+            return {}
+        chunk = np.stack(self._waiting)
+        self._waiting = []
+        if self._judge is not None:
+            self._chunks.append(chunk)
+        return {self.session: chunk}
 
     def render(self) -> Images | None:
         """Return the newest image (S, V·S, 3) as the model makes it."""
@@ -251,7 +239,7 @@ class WorldModelEnv(gymnasium.Env[Images, Float32s]):
         return image.copy() if self.size is None else resize(image[None], self.size)[0]
 
 
-class WorldModelVectorEnv(VectorEnv[Images, Float32s, NDArray[Any]]):
+class WorldModelVectorEnv(SyncVectorEnv):
     """N robots in a world model, whose sessions step in one pass and begin and end independently.
 
     Args:
@@ -259,6 +247,11 @@ class WorldModelVectorEnv(VectorEnv[Images, Float32s, NDArray[Any]]):
         autoreset_mode: of gymnasium: the step after an episode's end, the same step, or disabled.
         others, settings: as of `WorldModelEnv`, in its order or by name.
     """
+
+    envs: list[Any]  # of `WorldModelEnv`
+    metadata: dict[str, Any]
+    observation_space: Any
+    single_observation_space: Any
 
     def __init__(
         self,
@@ -271,81 +264,24 @@ class WorldModelVectorEnv(VectorEnv[Images, Float32s, NDArray[Any]]):
             raise UsageError("num_envs", f"is {num_envs}", "give a whole number of 1 or more")
         first = WorldModelEnv(*others, **settings)
         # copies made before any session is open: they share the world, its prompts and the warnings
-        self.envs = [first, *(copy.copy(first) for _ in range(num_envs - 1))]
+        super().__init__([partial(copy.copy, first)] * num_envs, autoreset_mode=autoreset_mode)
         self.world = first.world
         self.embodiment = first.embodiment
-        self.num_envs = num_envs
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
-        self.render_mode = first.render_mode
-        self.metadata = first.metadata | {"autoreset_mode": self.autoreset_mode}
-        self.single_action_space = first.action_space
-        self.single_observation_space = first.observation_space
-        self.action_space = batch_space(self.single_action_space, num_envs)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.observations = np.zeros(self.observation_space.shape or (), np.uint8)
-        self.ended: Bools = np.zeros(num_envs, np.bool_)
 
-    def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Images, dict[str, Any]]:
-        """Start episodes.
-
-        Args:
-            seed: one for each; a number is that of the first, and the others follow it.
-            options: "prompt": what all start from; "reset_mask": (N,) bool, those to start.
-        """
-        options = _known(options, "prompt", "reset_mask")
-        seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed
-        chosen = np.asarray(options.get("reset_mask", np.ones(self.num_envs)), np.bool_)
-        infos: dict[str, Any] = {}
-        prompt = {key: value for key, value in options.items() if key == "prompt"}
-        for i in np.flatnonzero(chosen):
-            infos = self._begin(i, infos, None if seeds is None else seeds[i], prompt)
-        self.ended[chosen] = False
-        return self.observations.copy(), infos
-
-    def step(
-        self, actions: Float32s
-    ) -> tuple[Images, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+    def step(self, actions: Any) -> tuple[Images, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         """Send an action, or a chunk, to each environment; those that get an image get it in one pass."""
-        again = self.ended & (self.autoreset_mode == AutoresetMode.NEXT_STEP)
-        if self.autoreset_mode == AutoresetMode.DISABLED and self.ended.any():
-            fault = f"the episodes of {np.flatnonzero(self.ended).tolist()} have ended"
+        ended = self._autoreset_envs
+        if self.autoreset_mode == AutoresetMode.DISABLED and ended.any():
+            fault = f"the episodes of {np.flatnonzero(ended).tolist()} have ended"
             raise HMAError("step", fault, 'reset them: reset(options={"reset_mask": …})')
-        rewards = np.zeros(self.num_envs)
-        terminated, truncated = (np.zeros(self.num_envs, np.bool_) for _ in range(2))
-        infos: dict[str, Any] = {}
-        made = self.advance(np.flatnonzero(~again), actions)
-        for i in np.flatnonzero(again):
-            infos = self._begin(i, infos)
-        for i, (seen, rewards[i], terminated[i], truncated[i], facts) in made:
-            self.observations[i] = seen
-            if self.autoreset_mode == AutoresetMode.SAME_STEP and (terminated[i] or truncated[i]):
-                infos = self._add_info(infos, {"final_obs": seen, "final_info": facts}, i)
-                infos = self._begin(i, infos)
-            else:
-                infos = self._add_info(infos, facts, i)
-        self.ended = np.logical_or(terminated, truncated)
-        return self.observations.copy(), rewards, terminated, truncated, infos
+        begins = ended & (self.autoreset_mode == AutoresetMode.NEXT_STEP)
+        self.dream(np.flatnonzero(~begins), actions)
+        return super().step(actions)
 
-    def advance(self, chosen: Ints, actions: Float32s) -> list[tuple[int, Any]]:
-        """Send actions (N, …) to the chosen environments in one pass; return their numbers and steps."""
+    def dream(self, chosen: Ints, actions: Any) -> None:
+        """Make the images of the next step of some environments in one pass, under actions (N, …)."""
         checked = [self.envs[i].checked(actions[i]) for i in chosen]  # all, before any is queued
         chunks = [self.envs[i].queue(values) for i, values in zip(chosen, checked, strict=True)]
         made = self.world.step({session: chunk for part in chunks for session, chunk in part.items()})
-        return [(i, self.envs[i].finish(made)) for i in chosen]
-
-    def render(self) -> tuple[Images, ...] | None:
-        """Return the newest image of each environment."""
-        return tuple(env.image for env in self.envs) if self.render_mode == "rgb_array" else None
-
-    def close_extras(self, **kwargs: Any) -> None:
-        """End the sessions."""
-        for env in self.envs:
-            env.close()
-
-    def _begin(
-        self, i: int, infos: dict[str, Any], seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> dict[str, Any]:
-        self.observations[i], facts = self.envs[i].reset(seed=seed, options=options)
-        return self._add_info(infos, facts, i)
+        for i in chosen:
+            self.envs[i].made = made
