@@ -9,8 +9,8 @@ reads a config.json of lerobot's own form, and a checkpoint has one of ours.
 N environments, A action dims.
 """
 
-from collections import deque
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -25,9 +25,10 @@ from lerobot.processor import (
 from torch import Tensor
 
 from hma_data.errors import UsageError
-from hma_model.config import POLICY
 from hma_model.lerobot_env import in_one_line, opened
 from hma_model.lerobot_env.vector import camera_names
+from hma_model.policies.acting import Acting
+from hma_model.worlds.images import Prompt
 from hma_model.worlds.world import load_world
 
 NO_TRAINING = "is trained by hma train with objectives={policy: 1.0}, and not by lerobot"
@@ -71,74 +72,56 @@ class WorldModelPolicy(PreTrainedPolicy):
     def __init__(self, config: WorldModelConfig, **unused: Any) -> None:
         super().__init__(config)
         with in_one_line():
-            checkpoint, self._embodiment = opened(config.checkpoint, config.embodiment, "--policy.embodiment")
-            self._cameras = camera_names(checkpoint, self._embodiment)
-            self._world = load_world(
-                config.checkpoint,
-                [self._embodiment],
-                device=config.device or "cpu",
-                unmask_steps=config.unmask_steps,
-                temperature=config.temperature,
-            )
-            self._world.model.require_readout(POLICY, config.checkpoint)
-            self._commands = self._world.action_spec(self._embodiment)
-            given = len(self._commands.low)
+            checkpoint, name = opened(config.checkpoint, config.embodiment, "--policy.embodiment")
+            self._where = f"policy {name}"
+            self._cameras = camera_names(checkpoint, name)
+            world = load_world(
+                config.checkpoint, [name], device=config.device or "cpu",
+                unmask_steps=config.unmask_steps, temperature=config.temperature,
+            )  # fmt: skip
+            robot = checkpoint.embodiment(name)
+            self._stride = robot.stride
             taken = (config.output_features or {}).get("action")
-            if taken is not None and tuple(taken.shape) != (given,):
-                fault = f"gives {given} values of action, the environment takes {taken.shape[0]}"
-                raise UsageError(f"policy {self._embodiment}", fault, "give a policy of this robot")
-        self.network = self._world.model  # lerobot moves it and counts its parameters
-        self._sessions: list[int] = []
+            if taken is not None and tuple(taken.shape) != (robot.action_dim,):
+                fault = f"gives {robot.action_dim} values of action, the environment takes {taken.shape[0]}"
+                raise UsageError(self._where, fault, "give a policy of this robot")
+            # what the policy takes of the arena that it acts in: lerobot's environments, as they come
+            scenes: Any = SimpleNamespace(name=name, seed=0, robot=SimpleNamespace(embodiment=robot))
+            self._arena: Any = SimpleNamespace(scenes=scenes)
+            self._policy = Acting(world, scenes, where=config.checkpoint)
+        self.network = world.model  # lerobot moves it and counts its parameters
         self.reset()
 
     def reset(self) -> None:
         """Forget the episodes."""
-        for session in self._sessions:
-            self._world.close(session)
-        self._sessions = []
-        self._ahead: deque[np.ndarray[Any, Any]] = deque()  # actions (N, A) that are still to be given
-        self._taken: list[np.ndarray[Any, Any]] = []  # actions (N, A) since the last image
+        self._steps = 0
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **unused: Any) -> Tensor:
         """Return the next actions (N, A); the model looks once for the actions of a chunk."""
-        if not self._ahead:
-            self._ahead.extend(self._chunk(batch))
-        action = self._ahead.popleft()
-        self._taken.append(action)
-        return torch.from_numpy(action)
+        self._arena.fresh = self._steps % self._stride == 0
+        if self._arena.fresh:
+            self._arena.images = images = self._images(batch)
+        if self._steps == 0:
+            width = len(self._policy.follower.spec.names) * self._stride
+            self._arena.prompts = [Prompt(image[None], np.zeros((0, width), np.float32)) for image in images]
+            self._policy.begin(self._arena)
+        self._steps += 1
+        return torch.from_numpy(self._policy.act(self._arena).astype(np.float32))
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **unused: Any) -> Tensor:
         """Return the actions (N, stride, A) from the newest images on; the next call counts them as taken."""
-        self._taken.extend(self._ahead)
-        self._ahead.clear()
-        self._taken = self._chunk(batch)
-        return torch.from_numpy(np.stack(self._taken, axis=1))
+        while self._steps % self._stride:  # what is left of a chunk counts as carried out
+            self.select_action(batch)
+        return torch.stack([self.select_action(batch) for _ in range(self._stride)], dim=1)
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Any] | None]:
         """Refuse to train."""
-        raise UsageError(self._embodiment, NO_TRAINING)
+        raise UsageError(self._where, NO_TRAINING)
 
     def get_optim_params(self) -> dict[str, Any]:
         """Refuse to train."""
-        raise UsageError(self._embodiment, NO_TRAINING)
-
-    def _chunk(self, batch: dict[str, Tensor]) -> list[np.ndarray[Any, Any]]:
-        images = self._images(batch)
-        if not self._sessions:
-            self._sessions = [
-                self._world.open(self._embodiment, image[None], seed=row) for row, image in enumerate(images)
-            ]
-        else:
-            seen, taken = (
-                dict(zip(self._sessions, values, strict=True))
-                for values in (images, np.stack(self._taken, axis=1))
-            )
-            self._world.observe(seen, taken)
-        self._taken = []
-        said = self._world.act(self._sessions)
-        given = np.stack([self._commands.clip(said[session]) for session in self._sessions])
-        return list(given.astype(np.float32).swapaxes(0, 1))
+        raise UsageError(self._where, NO_TRAINING)
 
     def _images(self, batch: dict[str, Tensor]) -> np.ndarray[Any, Any]:
         """Return the images (N, H, W, 3) uint8 of the model's cameras, side by side."""
@@ -149,7 +132,7 @@ class WorldModelPolicy(PreTrainedPolicy):
             there = ", ".join(key for key in batch if key.startswith("observation.image")) or "none"
             fault = f"needs {', '.join(missing)}; the images are {there}"
             with in_one_line():
-                raise UsageError(f"policy {self._embodiment}", fault, "rename them with --rename_map")
+                raise UsageError(self._where, fault, "rename them with --rename_map")
         views = torch.cat([batch[key] for key in keys], dim=3)
         pixels = (views * 255).round().clamp(0, 255).to(torch.uint8)
         return pixels.permute(0, 2, 3, 1).numpy(force=True)

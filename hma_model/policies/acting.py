@@ -57,7 +57,7 @@ class Follower:
         """Begin with the arena's prompts; an HMAError says that it shows more or fewer cameras."""
         (high, wide) = self.world.image_shape[:2]
         (height, width) = arena.images.shape[1:3]
-        if wide * height != width * high:
+        if wide // high != max(1, width // height):
             fault = f"sees {wide // high} views, and the images show {width // height}"
             raise HMAError(self._where, fault, "give a policy that sees the same cameras")
         for session in self.sessions:
@@ -129,27 +129,27 @@ class Acting:
         for name, value in {"horizon": horizon, "memory": memory}.items():
             if value is not None and value < 1:
                 raise UsageError(where, f"{name}={value} is not allowed", "give 1 or more")
-        self._follower = Follower(world, scenes, where, memory)
+        self.follower = Follower(world, scenes, where, memory)
         self._horizon = horizon
 
     def begin(self, arena: Arena) -> None:
-        self._follower.begin(arena)
+        self.follower.begin(arena)
         self._ahead: list[Float32s] = []  # actions (N, A) that are still to be given
 
     def act(self, arena: Arena) -> Float32s:
-        self._follower.look(arena)
+        self.follower.look(arena)
         if not self._ahead:
             self._ahead = self._chosen()
-        return self._follower.take(self._ahead.pop(0))
+        return self.follower.take(self._ahead.pop(0))
 
     def _chosen(self) -> list[Float32s]:
         """Return the actions (N, A) of the chunks up to the horizon."""
-        world = self._follower.world
-        sessions = self._follower.sessions
+        world = self.follower.world
+        sessions = self.follower.sessions
         made = list[Float32s]()
         kept = {session: world.snapshot(session) for session in sessions if self._horizon > 1}
         for chunk in range(self._horizon):
-            given = {one: self._follower.spec.clip(said) for one, said in world.act(sessions).items()}
+            given = {one: self.follower.spec.clip(said) for one, said in world.act(sessions).items()}
             made += list(np.stack([given[session] for session in sessions], axis=1))
             if chunk < self._horizon - 1:
                 world.step(given)

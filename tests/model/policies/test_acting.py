@@ -69,7 +69,7 @@ def test_what_it_imagines_ahead_is_forgotten() -> None:
             action = checked("it", policy, arena)
             runs[-1].append(action)
             arena.step(action * 0)
-            policy._follower._taken[-1] = action * 0  # both do the same, whatever they say
+            policy.follower._taken[-1] = action * 0  # both do the same, whatever they say
     runs[0], runs[1] = ([np.stack(part) for part in np.array_split(one, 3)] for one in runs)
     np.testing.assert_allclose(runs[0][0], runs[1][0], atol=1e-3)
     assert not np.allclose(runs[0][1], runs[1][1], atol=1e-3)  # of an imagined image, not of the true one
