@@ -35,17 +35,17 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/export": (1_169, 9_247, 9),
     "hma_model/generation": (1_638, 13_148, 9),
     "hma_model/hub": (1_066, 8_156, 6),
-    "hma_model/lerobot_env": (634, 4_814, 3),
+    "hma_model/lerobot_env": (625, 4_769, 3),
     "hma_model/network": (3_486, 30_231, 18),
     "hma_model/play": (1_610, 11_859, 8),
-    "hma_model/policies": (2_826, 20_252, 14),
+    "hma_model/policies": (2_826, 20_256, 14),
     "hma_model/released": (809, 6_821, 4),
     "hma_model/synthetic": (1_213, 9_330, 5),
     "hma_model/training": (3_693, 30_223, 20),
-    "hma_model/worlds": (1_542, 11_887, 6),
+    "hma_model/worlds": (1_478, 11_069, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_608, 516_630
-TEST_LINES = 48_337
+PRODUCT_LINES, PRODUCT_NODES = 65_535, 515_771
+TEST_LINES = 48_335
 DOC_WORDS = 41_997
 
 
