@@ -1,6 +1,5 @@
 """Read results of the benchmark, and show them: a table for a model card, a page, and two compared."""
 
-import hashlib
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from hma_data.errors import OutputError, UsageError
-from hma_data.storage.files import write_atomic
+from hma_data.storage.files import short_sha256, write_atomic
 from hma_data.tables import Table
 from hma_model.benchmark.planning import difference
 from hma_model.evaluation.intervals import ends_of, interval
@@ -209,7 +208,7 @@ def read_results(path: Path) -> dict[str, Any]:
 
 def digest(found: dict[str, Any]) -> str:
     """Return the SHA-256 of results."""
-    return hashlib.sha256(json.dumps(found).encode()).hexdigest()
+    return short_sha256(json.dumps(found), 64)
 
 
 @contextmanager

@@ -11,7 +11,6 @@ statistics that the stem was trained on. Parts that do not belong together are t
 Files of another `FORMAT_VERSION` are refused.
 """
 
-import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -21,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from hma_data.errors import CheckpointError, HMAError
 from hma_data.registry.embodiment import FIRST_CAMERA, ID_PATTERN, Embodiment
-from hma_data.storage.files import file_sha256, opened_weights, read_json
+from hma_data.storage.files import file_sha256, opened_weights, read_json, short_sha256
 from hma_data.storage.kinds import misplaced, unreadable
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.config import HMAConfig
@@ -302,7 +301,7 @@ def check_id(embodiment: str, where: object) -> None:
 
 def digest(tokenizer: Mapping[str, Any]) -> str:
     """Return sixteen hex digits of the SHA-256 of a tokenizer's spec."""
-    return hashlib.sha256(json.dumps(dict(tokenizer), sort_keys=True).encode()).hexdigest()[:16]
+    return short_sha256(json.dumps(dict(tokenizer), sort_keys=True))
 
 
 def require_tokenizer(config: HMAConfig, spec: "TokenizerSpec", where: object) -> None:

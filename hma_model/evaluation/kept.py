@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from hma_data.errors import HMAError
-from hma_data.storage.files import cache_folder
+from hma_data.storage.files import cache_folder, short_sha256
 from hma_data.storage.kept import keep_arrays, kept_arrays
 from hma_data.tokenizers.base import Tokenizer
 
@@ -47,8 +47,8 @@ def kept(kind: str, tokenizer: Tokenizer, facts: Mapping[str, Any], make: Callab
     if not isinstance(network := getattr(tokenizer, "network", None), nn.Module):
         return make()
     told = f"{kind} {sorted(facts.items())} {tokenizer.spec.digest} {_code()} {torch.__version__}"
-    digest = hashlib.sha256(f"{told} {weights_sha256(network)}".encode()).hexdigest()
-    path = cache_folder() / "readers" / f"{kind}-{digest[:32]}"
+    digest = short_sha256(f"{told} {weights_sha256(network)}", 32)
+    path = cache_folder() / "readers" / f"{kind}-{digest}"
     if (found := kept_arrays(path)) is not None:
         return found
     made = make()
@@ -97,8 +97,5 @@ def weights_sha256(network: nn.Module) -> str:
 
 @cache
 def _code() -> str:
-    digest = hashlib.sha256()
-    for pattern in CODE:
-        for path in sorted(Path(__file__).parents[2].glob(pattern)):
-            digest.update(path.read_bytes())
-    return digest.hexdigest()
+    files = [path for pattern in CODE for path in sorted(Path(__file__).parents[2].glob(pattern))]
+    return short_sha256(b"".join(path.read_bytes() for path in files), 64)

@@ -10,7 +10,6 @@ bytes of results.json.
     report.html     the same with pictures and curves
 """
 
-import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -29,7 +28,7 @@ from hma_data.loading.views import Cameras
 from hma_data.shards.manifest import MANIFEST
 from hma_data.shards.preview import tokenizer_of
 from hma_data.shards.reader import ShardSet
-from hma_data.storage.files import file_sha256, finite
+from hma_data.storage.files import file_sha256, finite, short_sha256
 from hma_data.storage.kept import KeptParts
 from hma_data.storage.paths import StrPath, as_path, as_text
 from hma_data.tokenizers.base import Tokenizer
@@ -169,8 +168,7 @@ def fingerprint(model: HMA, shards: ShardSet, settings: EvaluationSettings, netw
         "settings": asdict(settings),
         "networks": networks.facts,
     }
-    text = json.dumps(facts, sort_keys=True, default=str)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    return short_sha256(json.dumps(facts, sort_keys=True, default=str))
 
 
 @lru_cache(maxsize=1)

@@ -5,7 +5,6 @@ A hub is a folder, any fsspec URI, or a repository of the Hugging Face Hub; all 
 folder.
 """
 
-import hashlib
 import tempfile
 from collections.abc import Iterable
 from contextlib import suppress
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from hma_data.errors import CheckpointError, HMAError, HubError
 from hma_data.registry.embodiment import find
-from hma_data.storage.files import cache_folder
+from hma_data.storage.files import cache_folder, short_sha256
 from hma_data.storage.paths import StrPath, addressed, as_address, as_path, is_repository
 from hma_data.storage.remote import RemotePath
 from hma_model.checkpoint import io as checkpoints
@@ -281,8 +280,8 @@ def _pull(
         names += [f"embodiments/{name}/{part}" for part in (*shown, *PARTS)]
     place = folder = store.pull(names)
     if isinstance(folder, RemotePath):
-        key = f"{store.name} {values.get('trunk_sha256')}".encode()
-        place = cache_folder() / "hub" / hashlib.sha256(key).hexdigest()[:24]
+        key = f"{store.name} {values.get('trunk_sha256')}"
+        place = cache_folder() / "hub" / short_sha256(key, 24)
     place = out or place
     if place != folder:
         FolderStore(folder).download(names, place)

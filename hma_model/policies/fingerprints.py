@@ -4,7 +4,6 @@
 policy that was edited or trained again is scored again.
 """
 
-import hashlib
 import pickle
 import sys
 import uuid
@@ -13,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from hma_data.errors import HMAError
-from hma_data.storage.files import file_sha256
+from hma_data.storage.files import file_sha256, short_sha256
 from hma_model.checkpoint.folder import HEAD, STATS, STEM, YAML, Checkpoint
 from hma_model.evaluation.kept import weights_sha256
 from hma_model.network.model import HMA
@@ -63,7 +62,7 @@ def world_facts(world: World) -> dict[str, Any]:
 def object_sha256(value: Any) -> str:
     """Return the SHA-256 of an object as pickled; of one that cannot be pickled, another one in each call."""
     try:
-        return hashlib.sha256(pickle.dumps(value, protocol=5)).hexdigest()
+        return short_sha256(pickle.dumps(value, protocol=5), 64)
     except Exception:  # an object's own methods may raise anything
         return uuid.uuid4().hex
 

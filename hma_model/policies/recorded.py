@@ -9,7 +9,6 @@ episodes. How it does on generated frames stays unknown.
 N episodes, T frames after the prompt, A action dims.
 """
 
-import hashlib
 from collections.abc import Sequence
 from contextlib import closing, nullcontext
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from hma_data.console import human_count, print_table
 from hma_data.episodes.sheets import grid, png_bytes
 from hma_data.errors import UsageError
 from hma_data.shards.reader import ShardSet
+from hma_data.storage.files import short_sha256
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.arrays import Bools, Floats, Images, evenly
@@ -172,7 +172,7 @@ def evaluate_recorded(
         begun, beginnings = recorded_beginnings(world, scenes, labelled)
         for name, policy in zip(names, made, strict=True):
             _try(name, policy, world, begun)
-        digest = hashlib.sha256(labelled.manifest.to_text().encode()).hexdigest()
+        digest = short_sha256(labelled.manifest.to_text(), 64)
         files = folder_facts(Path(judge))
         judged_by = {"shards_sha256": digest, "judge": judge, "judge_sha256": files}
         kept = kept_policies(folder, world, scenes, frames, judged_by)

@@ -16,7 +16,6 @@ call continues. A policy that was changed in between is scored again.
 M policies, N episodes, T frames after the prompt, S pixels a side.
 """
 
-import hashlib
 import json
 import warnings
 from collections.abc import Callable, Sequence
@@ -30,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hma_data.errors import HMAError, UsageError
+from hma_data.storage.files import short_sha256
 from hma_data.storage.kept import KeptParts
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
@@ -372,7 +372,7 @@ def part_keys(
         (one, policy_facts(one, embodiment)) if isinstance(one, str) else (one[0], object_sha256(one[1]))
         for one in policies
     ]
-    return [hashlib.sha256(json.dumps([one, shared]).encode()).hexdigest()[:32] for one in own]
+    return [short_sha256(json.dumps([one, shared]), 32) for one in own]
 
 
 def kept_policies(

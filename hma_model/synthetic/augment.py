@@ -8,7 +8,6 @@ Finished batches lie in a folder of the output until the shards are written, so 
 N episodes, P frames of a prompt, T generated frames, A action dims, K = stride · A.
 """
 
-import hashlib
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
@@ -27,6 +26,7 @@ from hma_data.lab.simulator import embodiment, simulated
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.reader import ShardSet
+from hma_data.storage.files import short_sha256
 from hma_data.storage.kept import KeptParts, remove_kept
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
@@ -205,7 +205,7 @@ def augment(
     made_by |= {"precision": world.precision} | world_digests(world, settings.embodiment)
     begins = None if shards is None else ShardSet(shards)
     if begins is not None:
-        made_by["source_sha256"] = hashlib.sha256(begins.manifest.to_text().encode()).hexdigest()
+        made_by["source_sha256"] = short_sha256(begins.manifest.to_text(), 64)
     with locked(folder):
         done = dataset is None or holds_dataset(dataset, made_by)  # before anything is made
         found = finished(folder, made_by)

@@ -6,7 +6,6 @@ of its own.
 T frames, A action dims, K = stride · A.
 """
 
-import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -24,7 +23,7 @@ from hma_data.shards.manifest import MANIFEST
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.windows import episode_pieces
 from hma_data.sources.common.video_file import VideoFile, frame_table
-from hma_data.storage.files import file_sha256
+from hma_data.storage.files import file_sha256, short_sha256
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.arrays import Bools, Float32s, Ints
 from hma_model.checkpoint.folder import require_tokenizer
@@ -101,7 +100,7 @@ def read_film(world: World, place: StrPath, embodiment: str, hz: float) -> list[
 
 
 def _key(name: str, content: str) -> str:
-    return hashlib.sha256(f"{name}\n{content}".encode()).hexdigest()
+    return short_sha256(f"{name}\n{content}", 64)
 
 
 # -- shards

@@ -9,7 +9,6 @@ until all are written, so the same call continues.
 T frames, A action dims, K = stride · A.
 """
 
-import hashlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from hma_data.errors import EpisodeError, HMAError, OutputError, UsageError
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import Refused
+from hma_data.storage.files import short_sha256
 from hma_data.storage.kept import KeptParts, remove_kept
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
@@ -137,7 +137,7 @@ def label_actions(
             **world_digests(world, embodiment),
         }
         keys = "\n".join(episode.key for episode in episodes)
-        of_film = made_by | {"film_sha256": hashlib.sha256(keys.encode()).hexdigest()}
+        of_film = made_by | {"film_sha256": short_sha256(keys, 64)}
         manifest = finished(folder, of_film)
         if manifest is None:
             # The parts are kept under settings without the film: they are named by its content.

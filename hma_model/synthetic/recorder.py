@@ -7,7 +7,6 @@ T frames, V views stacked along the height, K = stride * action dim.
 """
 
 import json
-import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +25,7 @@ from hma_data.shards.writer import ShardWriter
 from hma_data.sources.base import EpisodeRef
 from hma_data.sources.lerobot import writer as lerobot_writer
 from hma_data.sources.lerobot.writer import LeRobotEpisode, write_lerobot
-from hma_data.storage.files import sync_folder
+from hma_data.storage.files import new_folder
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec
 from hma_model.arrays import Float32s
 from hma_model.evaluation.recorded_state import Reader
@@ -180,16 +179,11 @@ def write_as_lerobot(
     if reader is not None:
         provenance = own.provenance | {"state": how_read(own, reader)}
         own = Embodiment.from_values(own.to_dict() | {"provenance": provenance}, f"embodiment {own.id}")
-    part = folder.with_name(f".{folder.name}.part")
-    shutil.rmtree(part, ignore_errors=True)
-    try:
-        decoded = _decoded(made, own, tokenizer, reader)
-        write_lerobot(part, own, decoded, on_progress, made.manifest.plan["made_by"])
-        for path in (*part.rglob("*"), part):
-            sync_folder(path)
-        part.rename(folder)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
+    with new_folder(folder) as part:
+        part.rmdir()  # lerobot makes it itself
+        write_lerobot(
+            part, own, _decoded(made, own, tokenizer, reader), on_progress, made.manifest.plan["made_by"]
+        )
 
 
 def how_read(robot: Embodiment, reader: Reader) -> str:

@@ -6,7 +6,6 @@ recipe may name trackers: TensorBoard's event files in `tensorboard/` of the run
 `hma_model.training.runtime.run_errors`.
 """
 
-import hashlib
 import importlib
 import json
 import math
@@ -21,7 +20,7 @@ from typing import Any, TextIO
 
 from hma_data.console import Update, progress
 from hma_data.errors import MissingDependencyError, install_command
-from hma_data.storage.files import atomic_path, finite
+from hma_data.storage.files import atomic_path, finite, short_sha256
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.evaluation.rollout_video import SHEETS
 from hma_model.training.recipe import Recipe
@@ -66,8 +65,7 @@ class Remote:
         run = out.absolute().name
         given = {"project": recipe.project, "name": run, "config": recipe.values(), "resume": "allow"}
         if name == "wandb":  # wandb resumes a run by its id, trackio by its name
-            folder = hashlib.sha256(str(out.absolute()).encode()).hexdigest()
-            given["id"] = f"{run[:40]}-{folder[:12]}"
+            given["id"] = f"{run[:40]}-{short_sha256(str(out.absolute()), 12)}"
         self._package.init(**given)
 
     def scalars(self, step: int, values: Mapping[str, float]) -> None:

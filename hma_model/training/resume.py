@@ -23,7 +23,7 @@ from torch import Tensor
 
 from hma_data.errors import CheckpointError, RecipeError
 from hma_data.shards.reader import ShardSet
-from hma_data.storage.files import file_sha256, finite, read_json, to_json
+from hma_data.storage.files import file_sha256, finite, read_json, short_sha256, to_json
 from hma_model.checkpoint.folder import CONFIG, FORMAT_VERSION, HEAD, STEM, TRAINING, Checkpoint, inside
 from hma_model.checkpoint.weights import read_tensors, write_tensors
 from hma_model.config import HMAConfig
@@ -89,8 +89,7 @@ def seed_for(seed: int, what: str, *index: int) -> int:
 def data_digests(sets: Mapping[str, ShardSet]) -> dict[str, str]:
     """Return sixteen hex digits of a SHA-256 over the shards of each embodiment."""
     return {
-        name: hashlib.sha256("".join(s.sha256 for s in shards.manifest.shards).encode()).hexdigest()[:16]
-        for name, shards in sets.items()
+        name: short_sha256("".join(s.sha256 for s in shards.manifest.shards)) for name, shards in sets.items()
     }
 
 
@@ -108,7 +107,7 @@ def write_state(
 
 def _digest(values: Mapping[str, Any]) -> str:
     content = json.dumps({key: value for key, value in values.items() if key != "sha256"}, sort_keys=True)
-    return hashlib.sha256(content.encode()).hexdigest()
+    return short_sha256(content, 64)
 
 
 def require_version(path: Path) -> None:
