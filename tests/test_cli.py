@@ -146,9 +146,7 @@ def test_infer_writes_a_yaml_whose_questions_validate_lists(toy_yaml: Path, tmp_
         ("mixture none", 1, ["not a folder"]),
     ],
 )
-def test_what_is_wrong_is_one_line_and_wrong_usage_exit_code_two(
-    toy_yaml, tmp_path, words, code, said
-) -> None:
+def test_what_is_wrong_is_one_line_and_wrong_usage_exit_code_two(toy_yaml, tmp_path, words, code, said):
     (tmp_path / "empty").mkdir()
     fails(hma(*words.split(), cwd=tmp_path), code, *said)
 

@@ -138,9 +138,7 @@ def test_a_broken_source_is_one_error_that_names_its_package(module, said, insta
     )  # judged without importing it
 
 
-def test_a_broken_source_is_told_only_where_no_other_knows_the_recording(
-    install: Install, toy_robot: None, episodes: Path
-) -> None:
+def test_a_broken_source_is_told_only_where_no_other_knows_the_recording(install, toy_robot, episodes):
     install("bad-robot", {"bad_source.py": "1 / 0"}, {"hma_data.sources": {"aaa": "bad_source"}})
     assert detect(episodes / "episodes") == "npz" and detect("gs://bucket/folder") == "rlds"
     (episodes / "notes").mkdir()

@@ -18,7 +18,7 @@ from hma_data.inspection.inspect import examine
 from hma_data.registry.embodiment import Embodiment, problems
 from hma_data.shards.reader import ShardSet
 from tests.command import hma
-from tests.conftest import ARM_YAML, BlockTokenizer
+from tests.conftest import ARM_YAML
 from tests.data import bag_files, videos
 from tests.data.sources.lerobot.test_lerobot import embodiment as lerobot_arm
 
@@ -76,9 +76,7 @@ def as_bags(folder: Path) -> tuple[Embodiment, Path, dict[str, str]]:
 
 
 @pytest.mark.parametrize("made", [as_hdf5, as_lerobot, as_bags])
-def test_a_black_camera_is_refused_and_a_frozen_or_repeating_one_is_flagged(
-    made, tmp_path: Path, block_tokenizer: BlockTokenizer
-) -> None:
+def test_a_black_camera_is_refused_and_a_frozen_or_repeating_one_is_flagged(made, tmp_path, block_tokenizer):
     robot, source, ids = made(tmp_path)
     summary = convert(robot, source, block_tokenizer, tmp_path / "out", **NO_LIMIT)
     (refused,) = ShardSet(tmp_path / "out").refused()

@@ -292,9 +292,7 @@ def test_inspect_and_doctor_take_the_episodes_that_a_yaml_chooses(toy_yaml, toy_
     assert report["embodiment"]["first episode"].startswith("demo_5:")
 
 
-def test_a_recording_whose_name_is_not_utf8_is_refused_before_the_work(
-    tmp_path: Path, toy_yaml: Path, toy_recording: Path
-) -> None:
+def test_a_recording_whose_name_is_not_utf8_is_refused_before_the_work(tmp_path, toy_yaml, toy_recording):
     """Neither a YAML nor a shard can state such a name."""
     odd = tmp_path / os.fsdecode(b"r\xe9c.hdf5")
     try:

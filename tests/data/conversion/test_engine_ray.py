@@ -103,9 +103,7 @@ def test_an_actor_that_is_killed_between_two_units_costs_nothing(cluster, tmp_pa
 
 @on_a_cluster
 @pytest.mark.parametrize(("wanted", "said"), [({"gpus": 1}, r"1 GPU \(of 0\)"), ({"cpus": 500}, "500 CPU")])
-def test_a_worker_that_no_node_of_this_machine_can_hold_is_one_error(
-    cluster, monkeypatch: pytest.MonkeyPatch, wanted: dict[str, float], said: str
-) -> None:
+def test_a_worker_that_no_node_of_this_machine_can_hold_is_one_error(cluster, monkeypatch, wanted, said):
     from hma_data.conversion.engines import ray as engine
 
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
@@ -284,9 +282,7 @@ def test_a_cluster_that_does_not_answer_is_one_error(address, said, monkeypatch,
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("stated", "seen"), [(None, "False"), ("1", "True")])
-def test_actors_take_their_nodes_environment_unless_the_user_says_otherwise(
-    stated: str | None, seen: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_actors_take_their_nodes_environment_unless_the_user_says_otherwise(stated, seen, monkeypatch):
     monkeypatch.delenv(UV_ENVIRONMENT, raising=False)
     if stated:
         monkeypatch.setenv(UV_ENVIRONMENT, stated)

@@ -100,9 +100,7 @@ CALL = 'print(convert(robot, "toy.hdf5", "fsq-8", "out", workers=2).made_shards)
 
 
 @pytest.mark.slow
-def test_a_script_that_every_worker_would_run_is_told_to_guard_its_call(
-    toy_arm: Embodiment, toy_recording: Path, tmp_path: Path
-) -> None:
+def test_a_script_that_every_worker_would_run_is_told_to_guard_its_call(toy_arm, toy_recording, tmp_path):
     (tmp_path / "toy_arm.yaml").write_text(toy_arm.to_yaml())
 
     def run_script(name: str, text: str) -> subprocess.CompletedProcess[str]:
@@ -130,9 +128,7 @@ def test_a_script_that_every_worker_would_run_is_told_to_guard_its_call(
     assert "2" in done.stdout.splitlines()
 
 
-def test_one_share_is_done_by_one_job_and_a_whole_job_waits_for_none(
-    toy_arm: Embodiment, toy_recording: Path, tmp_path: Path
-) -> None:
+def test_one_share_is_done_by_one_job_and_a_whole_job_waits_for_none(toy_arm, toy_recording, tmp_path):
     out = tmp_path / "out"
     with locked(out, "0-of-2"):
         with pytest.raises(OutputError, match="another job is writing share 0-of-2"), locked(out, "0-of-2"):
@@ -193,9 +189,7 @@ def test_a_disk_that_refuses_any_byte_is_one_error_without_a_remnant(
     assert not list((tmp_path / "out").rglob("*.part"))
 
 
-def test_a_full_disk_is_one_error_and_what_was_made_is_kept(
-    toy_arm: Embodiment, toy_file: Path, tmp_path: Path, whole: dict[str, bytes], monkeypatch
-) -> None:
+def test_a_full_disk_is_one_error_and_what_was_made_is_kept(toy_arm, toy_file, tmp_path, whole, monkeypatch):
     add, calls = shard_work.ShardWriter.add, 0
 
     def full(self, episode, columns):

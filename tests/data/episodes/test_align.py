@@ -135,9 +135,7 @@ METHODS = st.sampled_from(["nearest", "hold", "interpolate"])
     states=METHODS,
     rate=st.sampled_from([None, 4.0, 16.0]),
 )
-def test_a_clip_is_the_lookup_of_every_frame_where_all_streams_run(
-    clocks: tuple[np.ndarray, ...], images: str, actions: str, states: str, rate: float | None
-) -> None:
+def test_a_clip_is_the_lookup_of_every_frame_where_all_streams_run(clocks, images, actions, states, rate):
     for clock in clocks:
         assume((np.diff(clock) > 0).all())
     sync = {"images": images, "actions": actions, "states": states} | ({"rate_hz": rate} if rate else {})

@@ -242,9 +242,7 @@ def test_passing_faults_stop_no_upload_and_cost_no_commit(toy_arm, toy_file, hub
 
 
 @pytest.mark.parametrize(("number", "told"), [(1, True), (2, False), (3, True)])
-def test_a_commit_whose_answer_was_lost_is_not_made_twice(
-    toy_arm, toy_file, hub, whole, number, told
-) -> None:
+def test_a_commit_whose_answer_was_lost_is_not_made_twice(toy_arm, toy_file, hub, whole, number, told):
     hub.habits.tells_oids = told
     plain, lost = hub.create("team/arm", "datasets").commit, []
 

@@ -121,9 +121,7 @@ def test_a_gripper_that_opens_and_closes_keeps_its_two_values(tmp_path: Path) ->
         assert gripper.get("normalize", True) is not kept
 
 
-def test_values_of_two_keys_have_own_names_and_a_short_bag_a_rate_at_which_a_model_sees_enough(
-    tmp_path,
-) -> None:
+def test_values_of_two_keys_have_own_names_and_a_short_bag_a_rate_at_which_a_model_sees_enough(tmp_path):
     topics = {"/image": (picture_of(), 20), "/cmd_vel": (twist(), 20)}
     values = inferred(bag(tmp_path / "run", topics, seconds=4))
     names = [name for one in values["action"]["components"] for name in one["names"]]

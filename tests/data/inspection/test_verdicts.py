@@ -345,9 +345,7 @@ def test_a_yaml_that_says_bgr_of_pictures_in_order_is_noticed(tmp_path: Path) ->
     assert [(one.check, one.severity) for one in found] == [("colour", "warn")]
 
 
-def test_a_sound_recording_has_no_finding_and_a_camera_that_the_robot_does_not_use_gives_none(
-    tmp_path,
-) -> None:
+def test_a_sound_recording_has_no_finding_and_a_camera_that_the_robot_does_not_use_gives_none(tmp_path):
     def damage(file: h5py.File) -> None:
         for demo in file["data"].values():
             demo["obs/spare"] = np.zeros((len(demo["actions"]), 16, 16, 3), np.uint8)

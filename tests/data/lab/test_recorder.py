@@ -173,9 +173,7 @@ def test_a_stopped_recording_continues_at_the_next_episode(tmp_path: Path) -> No
     ("way", "fault"),
     [("egl", "ImportError('Cannot initialize')"), ("osmesa", "AttributeError('glGetError')")],
 )
-def test_a_machine_that_cannot_draw_is_told_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], way: str, fault: str
-) -> None:
+def test_a_machine_that_cannot_draw_is_told_what_to_install(tmp_path, monkeypatch, capsys, way, fault):
     (tmp_path / "mujoco.py").write_text(f"def GLContext(width, height):\n    raise {fault}\n")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))

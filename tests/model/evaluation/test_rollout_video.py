@@ -92,9 +92,7 @@ def test_a_folder_of_sheets_is_listed_once_for_all_its_robots(tmp_path: Path, mo
     assert len(patterns) == 1
 
 
-def test_the_verb_tells_of_actions_outside_the_range_seen_in_training(
-    shards: ShardSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_verb_tells_of_actions_outside_the_range_seen_in_training(shards, tmp_path, monkeypatch, capsys):
     save(tmp_path / "model", {"arm": 2})
     model = HMA.from_pretrained(tmp_path / "model").eval()
     monkeypatch.setattr("hma_model.cli._opened", lambda *names: (model, Blocks(), shards))

@@ -191,9 +191,7 @@ def test_an_unknown_robot_is_one_line(tokens: Path, tmp_path: Path) -> None:
     assert "has no embodiment 'nobody'" in ended.stderr
 
 
-def test_a_pushed_page_lies_beside_the_checkpoint_and_replaces_an_older_one(
-    tokens: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_pushed_page_lies_beside_the_checkpoint_and_replaces_an_older_one(tokens, tmp_path, monkeypatch):
     def copy(checkpoint: str, data: list[Path], out: Path, *rest: Any) -> None:
         shutil.copytree(tokens, out)
 

@@ -40,9 +40,7 @@ def space(server: Hub) -> dict[str, bytes]:
     return server.repositories[f"spaces/{NAME}"].files
 
 
-def test_a_push_makes_a_static_space_of_the_page_and_replaces_an_older_one(
-    server: Hub, tokens: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_push_makes_a_static_space_of_the_page_and_replaces_an_older_one(server, tokens, monkeypatch):
     def copy(checkpoint: str, data: list[Path], out: Path, *rest: Any) -> None:
         shutil.copytree(tokens, out)
 

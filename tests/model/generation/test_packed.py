@@ -169,9 +169,7 @@ def test_without_a_compiler_the_same_frames_are_made_and_it_is_said(monkeypatch:
 @pytest.mark.parametrize(
     ("order", "digits", "temperature"), [("random", "chain", 0.5), ("confidence", "together", 0.0)]
 )
-def test_trunk_head_and_unmasking_compile_to_one_graph_of_each_pass(
-    order: str, digits: str, temperature: float, graphs: Graphs
-) -> None:
+def test_trunk_head_and_unmasking_compile_to_one_graph_of_each_pass(order, digits, temperature, graphs):
     model = small_model(masked_input="previous", digit_order=digits, told_noise=True)
     how = {"order": order, "temperature": temperature}
     made = _frames(model, compile=True, **how)

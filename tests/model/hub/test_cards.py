@@ -101,9 +101,7 @@ def test_a_card_says_what_is_left_of_objects_and_evaluating_again_keeps_it(folde
 
 
 @pytest.mark.parametrize("trained", [False, True])
-def test_a_loaded_models_verdict_is_published_unless_its_weights_have_changed(
-    folder: Path, tmp_path: Path, trained: bool
-) -> None:
+def test_a_loaded_models_verdict_is_published_unless_its_weights_have_changed(folder, tmp_path, trained):
     record_evaluation(Checkpoint.open(folder), "arm", {"verdict": NOT_YET, "follows": False})
     model = HMA.from_pretrained(str(folder))
     if trained:

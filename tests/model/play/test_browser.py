@@ -495,9 +495,7 @@ def test_a_page_whose_server_stopped_says_so_and_goes_on_when_it_is_back(browser
 
 
 @pytest.mark.parametrize(("width", "height"), [(390, 844), (844, 390), (667, 375), (820, 1180), (1024, 600)])
-def test_the_images_and_the_run_button_fit_on_the_screen_side_by_side(
-    browser: "Browser", address: str, width: int, height: int
-) -> None:
+def test_the_images_and_the_run_button_fit_on_the_screen_side_by_side(browser, address, width, height):
     context = browser.new_context(viewport={"width": width, "height": height})
     page = opened(context.new_page(), address)
     page.wait_for_timeout(100)

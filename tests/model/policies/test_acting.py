@@ -99,9 +99,7 @@ def test_models_that_cannot_act_and_unknown_options_are_refused() -> None:
         read_policy("hma:no/such run", scenes)
 
 
-def test_a_policys_module_may_extend_the_path_of_modules(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_policys_module_may_extend_the_path_of_modules(tmp_path, monkeypatch):
     (tmp_path / "own_policy.py").write_text("import sys\nsys.path.insert(0, 'theirs')\nact = len\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))

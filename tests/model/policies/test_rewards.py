@@ -163,9 +163,7 @@ def test_lerobots_evaluation_is_judged_by_it(world, shards, judge, caplog) -> No
     assert (infos["is_success"] == (highest > 0.5)).all()
 
 
-def test_synthetic_episodes_that_it_calls_failures_are_left_out(
-    world: World, shards: Path, judge: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_synthetic_episodes_that_it_calls_failures_are_left_out(world, shards, judge, tmp_path, monkeypatch):
     score = RewardModel.score
 
     def every_second(model: RewardModel, images: Any) -> Any:

@@ -58,9 +58,7 @@ def episodes(folder: Path) -> list[dict[str, Any]]:
     return [reader.episode(row, shards.manifest.cameras[0]) for row in shards.episodes.to_pylist()]
 
 
-def test_replayed_episodes_hold_the_recorders_actions_and_say_that_they_are_synthetic(
-    world: World, tmp_path: Path
-) -> None:
+def test_replayed_episodes_hold_the_recorders_actions_and_say_that_they_are_synthetic(world, tmp_path):
     manifest = augment(tmp_path / "out", asked(), world=world)
     assert verify(tmp_path / "out") == []
     made_by = manifest.plan["made_by"]

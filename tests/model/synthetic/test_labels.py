@@ -200,9 +200,7 @@ def shown(world: World, out: Path) -> dict[str, int]:
     return found
 
 
-def test_film_that_has_grown_or_changed_is_never_taken_for_what_was_labelled(
-    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_film_that_has_grown_or_changed_is_never_taken_for_what_was_labelled(world, tmp_path, monkeypatch):
     known = labels.LabelError("s", "val", ("a",), (0.1,), (1.0,), (None,), 9)
     monkeypatch.setattr(labels, "measure", lambda *_: known)
     monkeypatch.setattr(labels, "_check_set", lambda *_: None)
@@ -279,9 +277,7 @@ def test_film_that_pauses_is_labelled_in_parts(three: ShardSet, tmp_path: Path) 
 
 @pytest.mark.parametrize("views", ["wrist", ["side", "top"]])
 @pytest.mark.parametrize("three", [BlockTokenizer], indirect=True)
-def test_labelled_shards_name_the_cameras_that_their_images_are_of(
-    three: ShardSet, views: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_labelled_shards_name_the_cameras_that_their_images_are_of(three, views, tmp_path, monkeypatch):
     monkeypatch.setattr(labels, "yaml_of", generation_commands.yaml_of)
     known = labels.LabelError("s", "val", ("a",), (0.1,), (1.0,), (None,), 9)
     monkeypatch.setattr(labels, "measure", lambda *_: known)

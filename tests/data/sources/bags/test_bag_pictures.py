@@ -336,9 +336,7 @@ RECORDING = make_recording(12)
 @pytest.mark.parametrize(
     ("kind", "room"), [*((kind, 1) for kind in KINDS), ("ros1", 1 << 20), ("mcap-cdr-zstd", 1 << 20)]
 )
-def test_pictures_and_numbers_are_the_recorded_ones_with_and_without_room(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, room: int
-) -> None:
+def test_pictures_and_numbers_are_the_recorded_ones_with_and_without_room(tmp_path, monkeypatch, kind, room):
     monkeypatch.setattr(container, "CACHED_BYTES", room)
     episode = read(KINDS[kind](tmp_path, RECORDING), arm())
     stream = episode.streams["front"]

@@ -2,7 +2,6 @@
 
 import shutil
 from pathlib import Path
-from typing import Any
 
 import av
 import cv2
@@ -200,9 +199,7 @@ def test_a_crop_that_leaves_the_picture_is_refused() -> None:
 @pytest.mark.parametrize(
     "changes", [{}, {"color": "bgr", "flip": "horizontal", "rotate": 90}, {"crop": [1, 2, 7, 6]}]
 )
-def test_resizing_is_opencvs_on_a_packed_copy_bit_for_bit(
-    rule: str, resize_filter: Any, height: int, width: int, changes: dict[str, Any]
-) -> None:
+def test_resizing_is_opencvs_on_a_packed_copy_bit_for_bit(rule, resize_filter, height, width, changes):
     frames = np.random.default_rng(3).integers(0, 256, (3, height, width, 3), np.uint8)
     camera = Camera.model_validate({"name": "c", "key": "k", "resize": rule, **changes})
     stream = Pictures(np.arange(3.0), lambda index: frames[index])

@@ -45,9 +45,7 @@ def unknown(known: np.ndarray | None) -> list[int]:
 @pytest.mark.parametrize(
     ("action", "gone"), [("", [10, 11, 12]), ("/next", [9, 10, 11]), ("/delta", [9, 10, 11, 12])]
 )
-def test_a_masked_video_is_one_episode_whose_actions_are_known_where_their_hands_are(
-    folder: Path, action: str, gone: list[int]
-) -> None:
+def test_a_masked_video_is_one_episode_whose_actions_are_known_where_their_hands_are(folder, action, gone):
     robot = made.hand_video("landmarks", missing="mask", action=action)
     assert [(ref.id, ref.frames) for ref in open_source("hands").index(str(folder), robot)] == [
         ("a.mp4#0", LENGTH - 1)
