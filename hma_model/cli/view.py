@@ -52,7 +52,6 @@ def view(
 def _made(
     place: str, data: list[Path], embodiment: str | None, episode: int, tokenizer: str | None
 ) -> "View":
-    """Return the view of what lies at a place."""
     from hma_data.inspection.view import view_recording, view_shards
     from hma_data.storage.kinds import kind_of
     from hma_model.checkpoint.folder import BUNDLED

@@ -277,7 +277,6 @@ def _losses(
 
 
 def _joined(pairs: Iterable[tuple[torch.Tensor, torch.Tensor]]) -> tuple[Floats, Floats]:
-    """Return the nats and hits of batches as those of all windows."""
     nats, hits = (torch.cat(part).double().numpy(force=True) for part in zip(*pairs, strict=True))
     return nats, hits
 

@@ -85,7 +85,6 @@ class TeeFinder:
         return pusht.tee_places(self._nearer(points, pose))
 
     def _nearer(self, points: Floats, pose: Floats) -> Floats:
-        """Return the best pose near another."""
         step, best = FIRST_STEP, float(self._outside(points, pose[None])[0])
         ways = np.concatenate([np.eye(3), -np.eye(3)]) * (1, 1, 1 / TURN_RADIUS)
         while step > LAST_STEP:

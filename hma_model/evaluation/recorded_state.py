@@ -254,8 +254,6 @@ def _digits(value: float) -> float | None:
 
 
 class _States:
-    """Looks up the recorded states of windows."""
-
     def __init__(self, shards: ShardSet) -> None:
         self._shards = shards
         known = [name for name in mask_columns(shards.embodiment) if name == "state_known"]

@@ -146,7 +146,6 @@ def _meter(world: World, robot: str, unmask_steps: int) -> dict[str, Any]:
 
 @contextmanager
 def _written(out: Path) -> Iterator[Path]:
-    """Give the folder to fill; see `new_folder`."""
     try:
         with new_folder(out) as folder:
             yield folder
@@ -156,7 +155,6 @@ def _written(out: Path) -> Iterator[Path]:
 
 
 def _require_own(out: Path) -> None:
-    """Raise OutputError if a folder holds something else than an export."""
     if not out.exists():
         return
     if out.is_dir() and not any(out.iterdir()):

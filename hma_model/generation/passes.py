@@ -140,7 +140,6 @@ class Passes:
         return features[part.lanes], at if len(at) == 1 else at[part.lanes]
 
     def _carried(self) -> Carried:
-        """Return what the trunk carries of the rows' past frames."""
         appended = self.config.absent_tokens if self.passive else self.config.appended_tokens
         device, dtype = self.model.device.type, self.model.dtype
         if torch.is_autocast_enabled(device):

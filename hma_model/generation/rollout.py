@@ -271,7 +271,6 @@ class Rollout:
         return self.model.read_chunks(pooled, groups, POLICY, self.state.drawing(own))[:, 0]
 
     def _begun(self, rows: Sequence[int] | None) -> list[int]:
-        """Return the numbers of rows that have a prompt."""
         own = self._chosen(rows)
         for row in own:
             if not self.state.times[row]:
@@ -279,7 +278,6 @@ class Rollout:
         return own
 
     def _make_room(self, rows: list[int]) -> None:
-        """Make room for the next frame of rows."""
         if self.config.released:
             self.state.slide(rows)
         if not self.caching:

@@ -117,7 +117,6 @@ def _open(
 
 
 def _published(store: Store, remedy: str = "push it again") -> tuple[Manifest, bytes]:
-    """Return the published manifest and its bytes."""
     if MANIFEST not in store.files():
         raise HubError(store.name, f"has no {MANIFEST}", "is it a shard set, and has its push finished?")
     with tempfile.TemporaryDirectory() as folder:

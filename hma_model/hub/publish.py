@@ -295,7 +295,6 @@ def _pull(
 
 
 def _config(store: Store, files: dict[str, int]) -> dict[str, Any]:
-    """Return the values of config.json, checked."""
     if CONFIG not in files:
         raise HubError(
             store.name, f"has no {CONFIG}", "it is not a checkpoint of hma-toolkit; check the name"

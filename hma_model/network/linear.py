@@ -89,7 +89,6 @@ def product(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
 
 
 def _suits_onednn(linear: nn.Module, x: Tensor) -> bool:
-    """Check whether oneDNN is to compute this product."""
     if torch.compiler.is_compiling() or torch.is_autocast_enabled("cpu"):
         return False
     if x.device.type != "cpu" or x.dtype != torch.float32 or x.numel() < ROWS * x.shape[-1]:

@@ -6,7 +6,7 @@
     frames = model.generate(prompt, actions, embodiment.id, frames=8)
 
 B batch, T frames, h,w token grid, K = stride * action dim, F digits, V values of a digit, c channels
-and H,W grid of latents, p patch side, D width.
+and H,W grid of latents.
 """
 
 from collections.abc import Sequence
@@ -22,8 +22,7 @@ from hma_model.network.conditioning import Groups, align, unknown
 from hma_model.network.copying import frames_before
 from hma_model.network.network import Network
 from hma_model.network.objectives import Output, compute
-from hma_model.network.stem import patches_before, patchify, to_digits
-from hma_model.network.trunks.contract import TimePositions
+from hma_model.network.stem import to_digits
 
 if TYPE_CHECKING:
     from hma_data.loading.rows import Batch
@@ -96,47 +95,19 @@ class HMA(Network):
         Returns:
             (B, T, h, w, F, V) float32, low digit first; with `merge`, of the trunk's tokens and their digits.
         """
-        self._require("discrete", "video_logits")
+        if not self.config.discrete:
+            raise HMAError("video_logits", f"is of discrete models; this one is {self.config.kind}")
         groups, times = Groups.of(embodiment, len(tokens)), self.time_positions(tokens.shape[1])
         values = groups.sort(self.frame_values(tokens))
         given = None if true is None else to_digits(groups.sort(self.frame_values(true)), self.config.digits)
         before = None
         if self.config.copy_previous:
             before = frames_before(values, list(range(-1, values.shape[1] - 1)), self.config)
-        features = self._video_features(self.embed(values), actions, action_mask, groups, times)
+        chunks = None if actions is None else align(self.config, actions, action_mask, values.shape[1])
+        conditioning = self.condition(chunks, groups, times.positions)
+        features = self.video_features(self.trunk(self.embed(values), conditioning, times))
         scores = self.token_readout(features, given, before)
         return groups.unsort(self.token_readout.split(scores)).unflatten(2, self.config.token_grid)
-
-    def video_conditions(
-        self,
-        latents: Tensor,
-        mask: Tensor,
-        actions: Tensor | None,
-        embodiment: str | Sequence[str],
-        action_mask: Tensor | None = None,
-    ) -> Tensor:
-        """Compute the conditions under which `LatentReadout.sample` draws.
-
-        Args:
-            latents: (B, T, c, H, W), already multiplied by the configuration's `latent_scale`.
-            mask: (B, T, H, W) bool, True for latent pixels the model may not see.
-            actions, embodiment, action_mask: as in `video_logits`.
-
-        Returns:
-            (B, T, H/p, W/p, D); with `copy_previous` (B, T, H/p, W/p, D + c*p*p).
-        """
-        self._require("continuous", "video_conditions")
-        groups, times = Groups.of(embodiment, len(latents)), self.time_positions(latents.shape[1])
-        patches, pixels = (
-            groups.sort(patchify(values, self.config.patch)) for values in (latents, mask.unsqueeze(2))
-        )
-        before = None
-        if self.config.copy_previous:
-            before = patches_before(patches, pixels, range(-1, patches.shape[1] - 1), self.config.patch)
-        x = self.embed(patches, pixels)
-        features = self._video_features(x, actions, action_mask, groups, times)
-        conditions = self.latent_readout(features, times.positions, before)
-        return groups.unsort(conditions).unflatten(2, self.config.token_grid)
 
     @torch.no_grad()
     def predict_actions(
@@ -245,15 +216,3 @@ class HMA(Network):
         if actions is not None:
             warn_outside(self, actions[:, :used], embodiment, None if known is None else known[:, :used])
         return torch.stack(made, dim=1)
-
-    def _video_features(
-        self, x: Tensor, actions: Tensor | None, known: Tensor | None, groups: Groups, times: TimePositions
-    ) -> Tensor:
-        """Return the features of embedded frames and chunks (B, T, K), of which some are known (B, T)."""
-        given = None if actions is None else align(self.config, actions, known, len(times.positions))
-        conditioning = self.condition(given, groups, times.positions)
-        return self.video_features(self.trunk(x, conditioning, times))
-
-    def _require(self, kind: str, name: str) -> None:
-        if self.config.kind != kind:
-            raise HMAError(name, f"is of {kind} models; this one is {self.config.kind}")

@@ -65,7 +65,6 @@ def pads(robot: Drivable) -> list[Pad]:
 
 
 def _plane(robot: Drivable, x: int, y: int, up: bool) -> Pad:
-    """Return the pad of a robot that moves in the plane."""
     flips = (False, up)
     dims = robot.dimensions[x], robot.dimensions[y]
     if dims[0].kind == "rate":

@@ -281,7 +281,6 @@ def jpeg(image: Images) -> bytes:
 
 
 def _score(image: Images, true: Images) -> float:
-    """Return the PSNR of an image as the page shows it."""
     return round(float(psnr(true, image, limit=PSNR_LIMIT)), 2)
 
 

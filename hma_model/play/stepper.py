@@ -192,7 +192,6 @@ class Stepper:
         return min([SLEEP_S, *(wait for wait in waiting if wait > 0)])
 
     def _step_together(self, sessions: list[Session]) -> None:
-        """Step sessions of one world with the same sampling."""
         world, sampling = sessions[0].world, sessions[0].sampling
         world.decoding = replace(sampling, measure=any(session.meter is not None for session in sessions))
         begun = time.monotonic()

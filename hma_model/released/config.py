@@ -107,7 +107,6 @@ def _renamed(values: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, A
 
 
 def _shared(values: Mapping[str, Any], grid: Any) -> dict[str, Any]:
-    """Return the fields that both kinds of model have."""
     joint, tokens = bool(values["jointly_predict_actions"]), values["S"]
     height, width = (math.isqrt(tokens),) * 2 if grid is None else (int(part) for part in grid)
     if height * width != tokens:

@@ -273,7 +273,6 @@ def _still(stem: State) -> Tensor:
 
 
 def _modulation_back(stem: State, domain: str, config: HMAConfig) -> State:
-    """Convert the modulation of one embodiment."""
     released = {}
     for layer in range(config.layers):
         theirs = f"decoder.layers.{layer}.action_projectors.{domain}"

@@ -262,8 +262,6 @@ def _stated(
 
 
 class _Maker:
-    """A maker of batches of synthetic episodes."""
-
     def __init__(self, world: World, settings: Augmentation, shards: ShardSet | None) -> None:
         self.world = world
         self.settings = settings

@@ -94,7 +94,6 @@ def listed(windows: Sequence[str]) -> str:
 
 
 def _place(shards: ShardSet, episode: int, first: int, length: int) -> str:
-    """Describe a window of `length` frames by its robot, episode and frames."""
     rows = shards.episodes.filter(pc.equal(shards.episodes["episode_index"], episode))
     last = first + (length - 1) * shards.row_stride
     return f"{shards.embodiment.id} episode {episode} ({rows['id'][0]}) frames {first} to {last}"

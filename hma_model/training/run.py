@@ -306,7 +306,6 @@ class Run:
         return output
 
     def _generator(self, what: str, number: int) -> torch.Generator:
-        """Return the generator of a pass of this step for one purpose."""
         return torch.Generator().manual_seed(seed_for(self.recipe.seed, what, self.step, number))
 
     def _cropped(self, number: int, batch: Batch) -> Batch:

@@ -6,7 +6,9 @@ import torch
 
 from hma_data.loading.dataset import Batch
 from hma_model.config import ActionSpace, HMAConfig
+from hma_model.network.conditioning import Groups, align
 from hma_model.network.model import HMA
+from hma_model.network.stem import patchify
 
 ARM = ActionSpace("arm", 3, 2, (1.0, -2.0, 0.5), (2.0, 0.5, 1.0), (True, True, False))
 HAND = ActionSpace("hand.v1", 2, 1, (0.0, 3.0), (1.0, 0.0), (True, True))
@@ -51,3 +53,14 @@ def small_batch(config: HMAConfig, embodiment: list[str], seed: int = 0, frames:
         tokens=torch.randint(0, config.vocab_size, (b, t, *config.grid), generator=generator),
         latents=torch.randn(b, t, config.channels, *config.grid, generator=generator),
     )
+
+
+def conditions(model: HMA, latents: torch.Tensor, mask: torch.Tensor, actions: Any, robot: str) -> Any:
+    """Return the conditions (B, T, H/p, W/p, D) under which a continuous model draws its patches."""
+    config, count = model.config, latents.shape[1]
+    groups, times = Groups.of(robot, len(latents)), model.time_positions(count)
+    patches, hidden = (patchify(values, config.patch) for values in (latents, mask.unsqueeze(2)))
+    chunks = None if actions is None else align(config, actions, None, count)
+    conditioning = model.condition(chunks, groups, times.positions)
+    features = model.video_features(model.trunk(model.embed(patches, hidden), conditioning, times))
+    return model.latent_readout(features, times.positions).unflatten(2, config.token_grid)

@@ -16,7 +16,7 @@ from hma_model.config import CONDITIONINGS, OBJECTIVES, READOUTS, ActionSpace, O
 from hma_model.network.masking import draw_video_mask, drop_chunks
 from hma_model.network.model import HMA
 from hma_model.network.stem import from_digits, patchify, to_digits, unpatchify
-from tests.model.network_parts import ARM, HAND, seeded, small_batch, small_config, small_model
+from tests.model.network_parts import ARM, HAND, conditions, seeded, small_batch, small_config, small_model
 
 KINDS = ["discrete", "continuous"]
 
@@ -220,11 +220,11 @@ def test_masked_latents_are_not_seen() -> None:
     mask = torch.zeros(1, 5, 8, 8, dtype=torch.bool)
     mask[:, 2, 2:4, 4:6] = True
     with torch.no_grad():
-        one = model.video_conditions(batch.latents, mask, batch.actions, "arm")
+        one = conditions(model, batch.latents, mask, batch.actions, "arm")
         batch.latents[:, 2, :, 2:4, 4:6] += 5
-        assert torch.equal(one, model.video_conditions(batch.latents, mask, batch.actions, "arm"))
+        assert torch.equal(one, conditions(model, batch.latents, mask, batch.actions, "arm"))
         batch.latents[:, 2, :, 0, 0] += 5
-        assert not torch.equal(one, model.video_conditions(batch.latents, mask, batch.actions, "arm"))
+        assert not torch.equal(one, conditions(model, batch.latents, mask, batch.actions, "arm"))
 
 
 @pytest.mark.parametrize("kind", KINDS)

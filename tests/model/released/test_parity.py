@@ -16,6 +16,7 @@ from hma_model import hub
 from hma_model.network.model import HMA
 from hma_model.released.config import config_from_released
 from hma_model.released.state import state_from_released
+from tests.model.network_parts import conditions
 
 pytestmark = pytest.mark.real
 
@@ -54,9 +55,7 @@ def test_conditions_equal_the_released_code(imported: dict[str, Path], real_data
         model = HMA.from_pretrained(str(imported["continuous"]), embodiments=[embodiment])
         latents = io[f"{embodiment}.latents"].permute(0, 1, 4, 2, 3)
         with torch.no_grad():
-            z = model.video_conditions(
-                latents, io[f"{embodiment}.mask"], io[f"{embodiment}.actions"], embodiment
-            )
+            z = conditions(model, latents, io[f"{embodiment}.mask"], io[f"{embodiment}.actions"], embodiment)
         assert (z - io[f"{embodiment}.z"].permute(0, 2, 3, 4, 1)).abs().max() < 1e-4
 
 

@@ -22,7 +22,7 @@ from hma_model.released.config import config_to_released
 from hma_model.released.state import state_to_released
 from tests.command import fails, hma
 from tests.hub_server import connect, serve
-from tests.model.network_parts import small_batch, small_config
+from tests.model.network_parts import conditions, small_batch, small_config
 
 RELEASED: dict[str, Any] = {
     "layout": "released", "action_alignment": "current", "absent_action": "skip", "base_width": 256,
@@ -88,7 +88,7 @@ def _outputs(model: HMA) -> list[torch.Tensor]:
                         outputs.append(model.predict_actions(batch.tokens, name, actions))
                 else:
                     mask = torch.rand(2, model.config.frames, 8, 8, generator=torch.Generator()) < 0.3
-                    outputs.append(model.video_conditions(batch.latents, mask, actions, name))
+                    outputs.append(conditions(model, batch.latents, mask, actions, name))
                     generator = torch.Generator().manual_seed(1)
                     if model.config.trained_readouts:
                         chunks = model.predict_actions(batch.latents, name, actions, generator=generator)

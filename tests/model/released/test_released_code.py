@@ -17,6 +17,7 @@ from hma_model import hub
 from hma_model.checkpoint.io import save
 from hma_model.config import POLICY, ActionSpace, HMAConfig
 from hma_model.network.model import HMA
+from tests.model.network_parts import conditions
 
 os.environ.setdefault("XFORMERS_DISABLED", "true")  # read when its attention is imported
 try:
@@ -173,7 +174,7 @@ def test_an_imported_continuous_model_computes_the_same(tmp_path: Path, case: st
                 theirs.patchify(hidden),
                 actions,
             )
-            found = ours.video_conditions(latents.permute(0, 1, 4, 2, 3), mask, actions, name)
+            found = conditions(ours, latents.permute(0, 1, 4, 2, 3), mask, actions, name)
             _close(found, z.permute(0, 2, 3, 4, 1))
         level, condition = torch.tensor([0, 1, 500, 999]), torch.randn(4, config.d_model, generator=generator)
         noisy = torch.randn(4, SIZES[name][0] * SIZES[name][1], generator=generator)
