@@ -444,10 +444,11 @@ def _hz(key: KeyInfo) -> str:
 
 
 def _named(key: KeyInfo, names: tuple[str, ...] | None) -> dict[str, Any]:
-    """Return a component, with names where there is one for each value."""
+    """Return a component, with names where there is one for each value, which tell a quaternion."""
     count = dims(key)
     told = names if names and len(names) == count == len(set(names)) else None
-    return {"key": key.key, "dims": count} | ({"names": list(told)} if told else {})
+    found = {"key": key.key, "dims": count} | ({"names": list(told)} if told else {})
+    return found | ({"representation": "quaternion_xyzw"} if told == ("x", "y", "z", "w") else {})
 
 
 def _told_apart(components: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -60,14 +60,17 @@ def encode(
     return path
 
 
-def turn(path: Path) -> Path:
-    """Make an MP4 say that its camera was held upright: decoders turn its pictures clockwise."""
+def turn(path: Path, matrix: tuple[int, int, int, int] = (0, 1, -1, 0)) -> Path:
+    """Make an MP4 say that its camera was held upright, or another way: decoders turn its pictures.
+
+    Of the matrix, the first two numbers are where a step to the right leads, the others a step down.
+    """
     whole = path.read_bytes()
     unit = (1 << 16).to_bytes(4, "big")
     level = unit + bytes(12) + unit  # of the display matrix
-    quarter = bytes(4) + unit + bytes(4) + (-(1 << 16)).to_bytes(4, "big", signed=True) + bytes(4)
+    a, b, c, d = ((number << 16).to_bytes(4, "big", signed=True) for number in matrix)
     at = whole.index(level, whole.index(b"tkhd"))
-    path.write_bytes(whole[:at] + quarter + whole[at + 20 :])
+    path.write_bytes(whole[:at] + a + b + bytes(4) + c + d + whole[at + 20 :])
     return path
 
 

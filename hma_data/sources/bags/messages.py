@@ -132,14 +132,23 @@ def is_message(value: Any) -> bool:
 
 
 def field_names(message: Any) -> list[str]:
-    """Return the names of the fields in order, without constants (in rosbags: fields with a default)."""
+    """Return the names of the fields in order.
+
+    Constants do not count (in rosbags: fields with a default), nor what a message of protobuf leaves out.
+    """
     if isinstance(message, dict):
         return list(message)
     if dataclasses.is_dataclass(message):
         return [item.name for item in dataclasses.fields(message) if item.default is dataclasses.MISSING]
     if hasattr(message, "DESCRIPTOR"):
-        return [item.name for item in message.DESCRIPTOR.fields]
+        return [item.name for item in message.DESCRIPTOR.fields if not _is_left_out(message, item)]
     return []
+
+
+def _is_left_out(message: Any, field: Any) -> bool:
+    """Check whether a message of protobuf has no such part, or another one of a `oneof`: it would read 0."""
+    is_part = field.message_type is not None or field.containing_oneof is not None
+    return is_part and field.has_presence and not message.HasField(field.name)
 
 
 def child(message: Any, name: str) -> Any:
@@ -153,6 +162,8 @@ def child(message: Any, name: str) -> Any:
     fields = getattr(message, "__dataclass_fields__", None)
     if fields is None and hasattr(message, "DESCRIPTOR"):
         fields = message.DESCRIPTOR.fields_by_name
+        if name in fields and _is_left_out(message, fields[name]):
+            raise KeyError(name)
     if not fields or name not in fields:
         raise KeyError(name)
     return getattr(message, name)

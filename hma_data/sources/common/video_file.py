@@ -202,7 +202,7 @@ class VideoFile:
             frame = self._frame(index)
         if self._spoilt:
             raise EpisodeError(self.path, f"frame {index} is damaged, or depends on a damaged one")
-        return np.rot90(self._converter(frame), _quarters(frame))
+        return _upright(self._converter(frame), frame)
 
     def _count(self) -> None:
         """Identify frames only by their decoding order from here on.
@@ -296,6 +296,16 @@ class FilmRows(OneByOne):
 def _quarters(frame: Any) -> int:
     """Return the quarter turns to the left that a frame asks for: phones state here how they were held."""
     return round(frame.rotation / 90) % 4
+
+
+def _upright(image: Images, frame: Any) -> Images:
+    """Return the image turned as the frame asks, and mirrored, as front cameras do."""
+    quarters, matrix = _quarters(frame), frame.side_data.get("DISPLAYMATRIX")
+    if matrix is not None:
+        a, b, _, c, d, *_ = np.frombuffer(matrix, np.int32).tolist()
+        if a * d < b * c:
+            image, quarters = image[:, ::-1], quarters + 2
+    return np.rot90(image, quarters)
 
 
 def decoded_size(container: Any, stream: Any) -> tuple[int, int]:

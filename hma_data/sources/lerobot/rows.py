@@ -191,11 +191,18 @@ def _is_list(kind: Any) -> bool:
     return bool(pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind))
 
 
+def stated_times(rows: Rows, fps: float) -> Floats:
+    """Return the timestamps (T,) in seconds; those in ms, µs or ns show it by their steps."""
+    times: Floats = rows.numbers("timestamp").reshape(len(rows), -1)[:, 0].astype(np.float64)
+    periods = float(np.median(np.diff(times))) * fps if len(times) > 1 else 1.0
+    return times * next((unit for unit in (1e-3, 1e-6, 1e-9) if 0.5 < periods * unit < 2), 1.0)
+
+
 def times_of(rows: Rows, fps: float) -> Floats:
     """Return the times (T,) of an episode's rows in seconds; at the rate where they state none."""
     if "timestamp" not in rows.columns:
         return rate_times(len(rows), fps)
-    times = rows.numbers("timestamp").reshape(len(rows), -1)[:, 0].astype(np.float64)
+    times = stated_times(rows, fps)
     if not np.isfinite(times).all():
         raise EpisodeError(rows.path, "has timestamps that are not finite")
     if (np.diff(times) <= 0).any():

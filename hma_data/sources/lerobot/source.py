@@ -37,7 +37,7 @@ from hma_data.sources.common.video_file import FilmRows, VideoFile, frame_table
 from hma_data.sources.lerobot.films import BY_INDEX, Fit, fit_of, frames_of_rows, open_video
 from hma_data.sources.lerobot.language import language_of
 from hma_data.sources.lerobot.metadata import Feature, Folder, Metadata, episode_name
-from hma_data.sources.lerobot.rows import Rows, StillImages, rows_of, tasks_of, times_of
+from hma_data.sources.lerobot.rows import Rows, StillImages, rows_of, stated_times, tasks_of, times_of
 from hma_data.storage.files import short_sha256
 from hma_data.storage.paths import StrPath, as_text
 
@@ -315,8 +315,7 @@ class _Looking:
     def _column(self, rows: Rows, key: str) -> Series:
         feature = self._meta.features.get(key)
         if key == TIMES:
-            values = rows.numbers(key)
-            return Series(lambda: values, times=values.reshape(len(values), -1)[:, 0].astype(np.float64))
+            return Series(partial(rows.numbers, key), times=stated_times(rows, self._meta.fps))
         if feature and feature.is_camera:
             stream = StillImages(rows, key, np.zeros(len(rows)), self._meta.folder)
             return Series(None, stream.frames, len(rows), codec=stream.codec())
@@ -377,6 +376,7 @@ def _keys(meta: Metadata) -> tuple[KeyInfo, ...]:
             kind, codec = "camera", codec or _codec(meta, name)
             if len(shape) == 3 and shape[0] in (1, 3) and shape[2] not in (1, 3):  # stated as C, H, W
                 shape = (shape[1], shape[2], shape[0])
+            shape = (*shape[:2], 1 if shape[2:] == (1,) else 3)  # RGBA, or no channels stated: read as RGB
         elif feature.dtype in ("string", "large_string"):
             kind = "text"
         found.append(KeyInfo(name, kind, shape, feature.dtype, meta.fps, feature.value_names, codec))

@@ -398,11 +398,12 @@ def test_a_recording_without_commands_proposes_its_own_position_as_a_question(tm
 # -- LeRobot
 
 
-def test_the_size_of_frames_is_measured_whatever_info_json_states(tmp_path: Path) -> None:
+@pytest.mark.parametrize("shape", [[480, 640, 3], [480, 640, 4], [480, 640]])
+def test_the_size_of_frames_is_measured_whatever_info_json_states(tmp_path: Path, shape: list[int]) -> None:
     path = make_v2(tmp_path / "set")
     seen = [camera["size"] for camera in inferred(path)["cameras"]]
     info = json.loads((path / "meta/info.json").read_text())
-    info["features"][CAMERA]["shape"] = [480, 640, 3]
+    info["features"][CAMERA]["shape"] = shape
     (path / "meta/info.json").write_text(json.dumps(info))
     assert [camera["size"] for camera in inferred(path)["cameras"]] == seen
 

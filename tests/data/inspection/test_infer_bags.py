@@ -73,6 +73,9 @@ def test_both_arms_and_their_grippers_form_the_action(tmp_path: Path, form: str)
         "/left_arm/joint_states.position",
         "/right_arm/joint_states.position",
     ]
+    # Interpolated number by number, a quaternion that changes its sign would pass through 0.
+    turned = [part.get("representation") for part in values["state"]["components"]]
+    assert turned == [None, "quaternion_xyzw", None, None]
     assert values["frequency_hz"] == 30 and values["sync"]["max_skew_ms"] == 150
     assert questions(values).keys() == {"robot", "kind", "action.space"}
     assert first_clip(path, values).actions.shape[1] == 5

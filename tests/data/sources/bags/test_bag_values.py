@@ -1,19 +1,23 @@
 """Which numbers of a message become an action: by name wherever names stand, and those that move."""
 
+import struct
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from google.protobuf import descriptor_pb2
 from mcap.writer import Writer
 
 from hma_data.errors import EpisodeError
 from hma_data.inspection.infer import infer
 from hma_data.registry.embodiment import Embodiment
-from hma_data.sources.bags.messages import value_names
+from hma_data.sources.bags.container import Channel
+from hma_data.sources.bags.messages import decode, field_names, numbers, value_names
+from hma_data.sources.bags.topic_track import parse_key
 from hma_data.storage.yaml_io import parse_yaml
 from tests.data import ros2
-from tests.data.bag_files import SOURCE
+from tests.data.bag_files import MESSAGE, NUMBER, ONE, SOURCE
 from tests.data.sources.bags.test_bag_pairing import at, pairs, robot
 
 FRAMES = 12
@@ -154,3 +158,23 @@ def test_a_key_reads_the_type_that_has_its_field_and_infer_asks(tmp_path: Path) 
     assert any(said in problem for problem in SOURCE.inspect(str(path)).problems)
     asked = parse_yaml(infer(str(path), "x"), "x")["provenance"]["action"]
     assert asked.startswith("TODO") and said in asked
+
+
+def test_what_a_protobuf_message_leaves_out_is_no_zero() -> None:
+    """Of a `oneof` the other part was sent; without this its values would be zeros."""
+    files = descriptor_pb2.FileDescriptorSet()
+    file = files.file.add(name="toy.proto", package="toy", syntax="proto3")
+    part = file.message_type.add(name="Part")
+    part.field.add(name="q", number=1, type=NUMBER, label=ONE)
+    command = file.message_type.add(name="Command")
+    command.oneof_decl.add(name="how")
+    for number, name in enumerate(("joint", "pose"), 1):
+        about = {"type": MESSAGE, "type_name": ".toy.Part", "label": ONE, "oneof_index": 0}
+        command.field.add(name=name, number=number, **about)
+    command.field.add(name="force", number=3, type=NUMBER, label=ONE)
+    channel = Channel("/cmd", "toy.Command", "protobuf", "protobuf", files.SerializeToString())
+    sent = decode(channel, b"\x12\x09\x09" + struct.pack("<d", 0.5), "")  # pose {q: 0.5}
+    assert field_names(sent) == ["pose", "force"] and numbers(sent) == [0.5, 0.0]
+    assert parse_key("/cmd.pose.q", ["/cmd"], "").value(sent, "") == 0.5
+    with pytest.raises(EpisodeError, match="no field 'joint' — the fields there: pose, force"):
+        parse_key("/cmd.joint.q", ["/cmd"], "").value(sent, "")

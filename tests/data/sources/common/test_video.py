@@ -86,6 +86,22 @@ def test_an_index_outside_is_an_index_error(video: Path) -> None:
         VideoFile(video).frames([LENGTH])
 
 
+@pytest.mark.parametrize(
+    ("matrix", "shown"),
+    [
+        ((-1, 0, 0, 1), lambda plain: plain[:, ::-1]),
+        ((1, 0, 0, -1), lambda plain: plain[::-1]),
+        ((-1, 0, 0, -1), lambda plain: plain[::-1, ::-1]),
+        ((0, 1, 1, 0), lambda plain: plain.transpose(1, 0, 2)),
+    ],
+    ids=["left-right", "upside down", "half a turn", "across"],
+)
+def test_a_file_that_says_it_is_mirrored_is_shown_so(tmp_path: Path, matrix: Any, shown: Any) -> None:
+    path = encode(tmp_path / "v.mp4", [20, 21])
+    plain = VideoFile(path).frames([0])[0]
+    np.testing.assert_array_equal(VideoFile(turn(path, matrix)).frames([0])[0], shown(plain))
+
+
 def test_a_file_filmed_upright_is_turned(tmp_path: Path) -> None:
     path = turn(encode(tmp_path / "v.mp4", [20, 21]))
     table = frame_table(path)

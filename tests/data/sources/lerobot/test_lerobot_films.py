@@ -223,6 +223,13 @@ def test_rows_in_any_order_are_brought_into_the_episodes(shared: Path, left_out:
     assert not any("back" in text for text in open_source("lerobot").inspect(str(shared)).problems)
 
 
+@pytest.mark.parametrize("unit", [1e3, 1e6, 1e9])
+def test_timestamps_in_another_unit_are_brought_to_seconds(shared: Path, unit: float) -> None:
+    change_column(data(shared), "timestamp", lambda value, row: value * unit)
+    assert outcome(shared) == ["right"] * 3
+    assert open_source("lerobot").inspect(str(shared)).problems == ()
+
+
 def test_a_row_that_is_there_twice_or_not_at_all_is_named(shared: Path) -> None:
     whole = pq.read_table(data(shared))
     doubled = pa.concat_tables([whole.slice(0, 5), whole.slice(4, 1), whole.slice(6)])
