@@ -314,6 +314,7 @@ class _Draft:
     def _cameras(self) -> list[dict[str, Any]]:
         doubtful = "layout" in self.found.facts and "simulator" not in self.found.facts
         asked = {"color": f"{TODO}: rgb or bgr? arrays that went through OpenCV are often bgr"}
+        known = {"sure": {"color": "bgr"}, "no": {}}
         return [
             {
                 "name": name,
@@ -321,7 +322,7 @@ class _Draft:
                 "size": list(map(int, key.shape[:2])),
                 **_levels(key),
                 **(framed.keys if (framed := _framing(key)) else {}),
-                **(asked if doubtful and not is_video(key.key) else {}),
+                **known.get(key.swapped or "", asked if doubtful and not is_video(key.key) else {}),
             }
             for name, key in zip(camera_names(self.seen.keys), self.seen.keys, strict=True)
         ]
@@ -414,7 +415,7 @@ def _showing(seen: Choice, findings: Iterable[Finding]) -> tuple[Choice, list[st
     Where all of them do, all are kept: the recording may be all that there is.
     """
     keys = {key.key for key in seen.keys}
-    found = [one for one in findings if one.check in ("blank", "still") and one.key in keys]
+    found = [one for one in findings if one.check in ("blank", "still", "colour") and one.key in keys]
     never = {
         one.key for one in found if one.check == "blank" and one.numbers["blank"] == one.numbers["episodes"]
     }

@@ -15,12 +15,15 @@ from typing import Any
 import numpy as np
 
 from hma_data.errors import EpisodeError
+from hma_data.sources.bags.clocks import DAY_S, SECOND_NS
 from hma_data.sources.bags.container import Channel, Data
 
 Decode = Callable[[Data], Any]
 IDL_SEPARATOR = "=" * 80 + "\n"
 TIME_FIELDS = (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos"))
 WELL_KNOWN = "google/protobuf/"
+UNITS_NS = (1, 10**3, 10**6, 10**9)
+LATEST = 2.0**63  # nanoseconds since 1970
 STAMPS = (("header", "stamp"), ("timestamp",), ("stamp",))
 
 
@@ -235,8 +238,11 @@ def _field_numbers(message: Any, name: str) -> list[float]:
         raise TypeError(f"{text} of {name}" if " in " in text else f"{text} in {name}") from fault
 
 
-def stamp_ns(message: Any) -> int:
-    """Return the message's own time in nanoseconds; 0 where it has none."""
+def stamp_ns(message: Any, received_ns: int) -> int:
+    """Return the message's own time in nanoseconds; 0 where it has none.
+
+    A single number is a time if it is one in some unit, near the time of receipt; others count from a start.
+    """
     for path in STAMPS:
         value = message
         try:
@@ -244,6 +250,9 @@ def stamp_ns(message: Any) -> int:
                 value = child(value, name)
         except KeyError:
             continue
+        if isinstance(value, int | float):
+            times = (round(value * unit) for unit in UNITS_NS if abs(value) < LATEST)  # false for NaN
+            return next((ns for ns in times if abs(ns - received_ns) < DAY_S * SECOND_NS), 0)
         for names in TIME_FIELDS:
             try:
                 seconds, nanoseconds = (child(value, name) for name in names)

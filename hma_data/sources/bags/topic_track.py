@@ -24,7 +24,7 @@ from hma_data.episodes.episode import Stream
 from hma_data.errors import EpisodeError
 from hma_data.registry.components import Component
 from hma_data.sources.bags.bag import Bag, BagPlace
-from hma_data.sources.bags.clocks import MessageTimes
+from hma_data.sources.bags.clocks import DAY_S, SECOND_NS, MessageTimes
 from hma_data.sources.bags.container import Channel
 from hma_data.sources.bags.images import (
     VIDEO,
@@ -304,7 +304,7 @@ class TopicTrack:
         if channel not in self.channels:
             self.channels.append(channel)
         self._log_ns.append(min(log_ns, INT64.max))
-        self._stamp_ns.append(min(max(stamp_ns(message), INT64.min), INT64.max))
+        self._stamp_ns.append(min(max(stamp_ns(message, log_ns), INT64.min), INT64.max))
         self._places.extend((*place, self.channels.index(channel)))
 
     def _is_keyframe(self, message: Any) -> bool | None:
@@ -318,9 +318,14 @@ class TopicTrack:
 
     @property
     def times(self) -> MessageTimes:
-        """Return the times of the messages; none can be added while the caller holds them."""
+        """Return the times of the messages; none can be added while the caller holds them.
+
+        A stamp of 0 is none, but a simulation's first messages may have it, at the start of its clock.
+        """
         stamps = np.frombuffer(self._stamp_ns, np.int64)
-        known = bool(len(stamps) and np.all(stamps)) and not self.frozen
+        zeros = int(np.argmax(stamps != 0)) if len(stamps) else 0
+        begins = not zeros or stamps[zeros] < DAY_S * SECOND_NS
+        known = bool(len(stamps) and begins and np.all(stamps[zeros:])) and not self.frozen
         received = np.frombuffer(self._log_ns, np.int64)
         return MessageTimes(self.topic, received, stamps if known else None, self.places()[:, 0])
 

@@ -132,10 +132,11 @@ def measure(times: Floats) -> StreamTimes:
 def rate(times: Floats) -> tuple[float | None, float | None]:
     """Return Hz and jitter_ms, the standard deviation of the intervals; leave out a few pauses from both.
 
-    The rate comes from the median interval. Where bursts make the median and the mean differ by half, it
-    comes from the mean interval.
+    Samples with equal stamps count once, as they give one frame. The rate comes from the median interval.
+    Where bursts make the median and the mean differ by half, it comes from the mean interval.
     """
     steps = np.diff(times)
+    steps = steps[steps != 0]
     if len(steps) < 2 or steps.sum() <= 0:
         return None, None
     median = float(np.median(steps))

@@ -519,11 +519,11 @@ class RecordedRows:
 def masks_of(handle: h5py.File) -> dict[str, set[str]]:
     """Return robomimic's filter keys: name -> names of demos."""
     mask = inside(handle, "mask")
-    lists = mask.items() if isinstance(mask, h5py.Group) else ()
+    lists = {name: inside(mask, name) for name in mask} if isinstance(mask, h5py.Group) else {}
     return {
         name: {text(row).rsplit("/", 1)[-1] for row in found[()]}
-        for name, found in lists
-        if isinstance(found, h5py.Dataset) and found.ndim == 1
+        for name, found in lists.items()
+        if isinstance(found, h5py.Dataset) and found.ndim == 1 and not is_elsewhere(found, mask)
     }
 
 

@@ -306,15 +306,19 @@ def _instruction(folder: RldsFolder, steps: Steps, key: str | None) -> str:
 
 
 def _success(folder: RldsFolder, steps: Steps) -> bool | None:
-    """Return the stated success; without one, True where the last step is terminal and has a reward > 0."""
+    """Return the stated success; without one, True where the last step is terminal and has the reward 1.
+
+    A reward that takes other values than 0 and 1 grows on the way, and tells nothing.
+    """
     stated = folder.features.get("episode_metadata/success")
     if stated:
         value = scalar(steps.example, stated)
         return bool(value) if isinstance(value, bool | int) else None
     if any(key not in steps.features for key in ("reward", "is_terminal")):
         return None
-    ends = [steps.numbers(key)[-1] for key in ("reward", "is_terminal")]
-    return True if all(end.size == 1 and end > 0 for end in ends) else None
+    rewards, ends = (steps.numbers(key).reshape(steps.count, -1) for key in ("reward", "is_terminal"))
+    sparse = rewards.shape[1] == 1 and np.isin(rewards, (0, 1)).all()
+    return True if sparse and rewards[-1] and ends[-1].all() else None
 
 
 def _metadata(folder: RldsFolder, example: Example) -> dict[str, Any]:

@@ -299,6 +299,18 @@ def test_aloha_asks_for_colours_and_for_the_base(tmp_path: Path, compressed: boo
     assert not [found for found in said if "compress_len" in str(found)]  # (cameras, T) by design
 
 
+@pytest.mark.parametrize(("stored", "color"), [("rgb", None), ("bgr", "bgr")])
+def test_images_that_once_were_jpeg_answer_the_question_of_colours(tmp_path, stored, color) -> None:
+    soft = [cv2.GaussianBlur(shot, (0, 0), 1) // 2 + 64 for shot in pictures()]
+    shots = np.stack([cv2.imdecode(cv2.imencode(".jpg", shot)[1], cv2.IMREAD_COLOR) for shot in soft])
+    with h5py.File(tmp_path / "run.hdf5", "w") as file:
+        file["observations/images/cam"] = shots if stored == "bgr" else shots[..., ::-1]
+        file["action"] = numbers(T, 3)
+    values = inferred(tmp_path / "run.hdf5")
+    assert values["cameras"][0].get("color") == color
+    assert ("red and blue are swapped" in values["provenance"].get("cameras", "")) == (color == "bgr")
+
+
 def test_a_simulators_state_is_not_the_robots(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "run.hdf5", "w") as file:
         demo = file.create_group("data/demo_0")

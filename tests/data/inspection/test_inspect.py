@@ -285,6 +285,7 @@ def test_a_clock_counts_what_was_done_to_it() -> None:
 def test_a_pause_changes_neither_rate_nor_jitter() -> None:
     times = np.arange(100) / 10 + 30.0 * (np.arange(100) >= 40)
     assert checks.rate(times) == (pytest.approx(10), pytest.approx(0, abs=1e-6))
+    assert checks.rate(np.repeat(times, 2))[0] == pytest.approx(10)  # a driver that sends each frame twice
     bursts = np.concatenate([start + np.arange(5) / 1000 for start in range(20)])
     assert checks.rate(bursts)[0] == pytest.approx(5, rel=0.1)
 

@@ -1,5 +1,6 @@
 """Which numbers of a message become an action: by name wherever names stand, and those that move."""
 
+import math
 import struct
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,8 @@ from hma_data.errors import EpisodeError
 from hma_data.inspection.infer import infer
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.bags.container import Channel
-from hma_data.sources.bags.messages import decode, field_names, numbers, value_names
-from hma_data.sources.bags.topic_track import parse_key
+from hma_data.sources.bags.messages import decode, field_names, numbers, stamp_ns, value_names
+from hma_data.sources.bags.topic_track import TopicTrack, parse_key
 from hma_data.storage.yaml_io import parse_yaml
 from tests.data import ros2
 from tests.data.bag_files import MESSAGE, NUMBER, ONE, SOURCE
@@ -158,6 +159,27 @@ def test_a_key_reads_the_type_that_has_its_field_and_infer_asks(tmp_path: Path) 
     assert any(said in problem for problem in SOURCE.inspect(str(path)).problems)
     asked = parse_yaml(infer(str(path), "x"), "x")["provenance"]["action"]
     assert asked.startswith("TODO") and said in asked
+
+
+@pytest.mark.parametrize("unit", [1, 10**3, 10**6, 10**9])
+def test_a_stamp_may_be_one_number_near_receipt(unit: int) -> None:
+    received = 1_700_000_000_250_000_000
+    for number in (received // unit, received / unit):
+        assert abs(stamp_ns({"timestamp": number}, received + 10**9) - received) < max(unit, 10**3)
+    for number in (5 * 10**9, math.nan, math.inf, True):  # microseconds since the robot was switched on
+        assert stamp_ns({"timestamp": number}, received) == 0
+
+
+@pytest.mark.parametrize(
+    ("stamps", "are_used"),
+    [([0, 0, 0.1, 0.2], True), ([0, 0, 1.7e9, 1.7e9 + 1], False), ([0.1, 0, 0.2], False), ([0, 0], False)],
+)
+def test_a_simulation_may_begin_at_0(stamps: list[float], are_used: bool) -> None:
+    track = TopicTrack("/cmd")
+    for i, seconds in enumerate(stamps):
+        stamp = {"sec": int(seconds), "nsec": round(seconds % 1 * 1e9)}
+        track.add(Channel("/cmd", "", "json"), at(i), (0, 0, i), {"header": {"stamp": stamp}})
+    assert (track.times.stamps is not None) == are_used
 
 
 def test_what_a_protobuf_message_leaves_out_is_no_zero() -> None:

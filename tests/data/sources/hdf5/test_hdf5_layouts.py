@@ -343,6 +343,15 @@ def test_a_link_within_the_file_is_an_episode(tmp_path: Path) -> None:
     assert source.inspect(str(path)).problems == ()
 
 
+def test_a_mask_in_another_file_counts_for_nothing(tmp_path: Path) -> None:
+    path = linked(tmp_path, h5py.SoftLink("/store/x"))
+    with h5py.File(tmp_path / "other.part", "a") as other, h5py.File(path, "a") as file:
+        other["names"] = file["mask/train"][()]
+        del file["mask/train"]
+        file["mask/train"] = h5py.ExternalLink("other.part", "/names")
+    assert [ref.split for ref in open_source("hdf5").index(str(path), robot())] == [None] * 3
+
+
 def test_a_mask_that_names_an_absent_demo_is_named(tmp_path: Path) -> None:
     path = linked(tmp_path, h5py.SoftLink("/store/x"))
     with h5py.File(path, "a") as file:

@@ -189,8 +189,9 @@ def test_success_as_the_episode_states_it(tmp_path, stated, expected):
     assert read(folder, "train/000000").success is expected
 
 
-def test_success_is_unknown_without_a_rewarded_terminal_step(tmp_path):
-    folder = write(tmp_path / "d", {"d-train.tfrecord": [record(0, 2) | {"steps/is_terminal": [0, 0]}]})
+@pytest.mark.parametrize("ends", [{"steps/is_terminal": [0, 0]}, {"steps/reward": [0.2, 0.7]}])
+def test_success_is_unknown_without_a_rewarded_terminal_step_or_with_dense_rewards(tmp_path, ends):
+    folder = write(tmp_path / "d", {"d-train.tfrecord": [record(0, 2) | ends]})
     assert read(folder, "train/000000").success is None
 
 
