@@ -29,6 +29,7 @@ from hma_data.sources.bags.images import (
 )
 from hma_data.sources.bags.messages import (
     child,
+    child_of_each,
     decode,
     field_names,
     is_list,
@@ -430,8 +431,8 @@ def _element_values(key: str, elements: Any, owners: tuple[Any, ...]) -> list[Ke
         return _vector(key, elements, owners)
     found: list[KeyInfo] = []
     for name in names:
-        inside = [child(element, name) for element in elements]
-        if _is_number(inside[0]) or is_list(inside[0]):
+        inside = child_of_each(elements, name)
+        if inside and (_is_number(inside[0]) or is_list(inside[0])):
             found += _vector(f"{key}.{name}", inside, (elements, *owners))
     return found
 

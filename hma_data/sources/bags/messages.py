@@ -172,6 +172,12 @@ def child(message: Any, name: str) -> Any:
     return getattr(message, name)
 
 
+def child_of_each(messages: Sequence[Any], name: str) -> list[Any]:
+    """Return the value of a field in each message of a list; empty where one lacks it."""
+    there = all(is_message(one) and name in field_names(one) for one in messages)
+    return [child(one, name) for one in messages] if there else []
+
+
 def is_list(value: Any) -> bool:
     """Check whether a value is a list or an array, not text or bytes."""
     return isinstance(value, np.ndarray | Sequence) and not isinstance(value, str | bytes)
@@ -197,8 +203,7 @@ def value_names(owners: Sequence[Any], width: int) -> tuple[str, ...]:
     """
     for owner in owners:
         if is_message_list(owner):
-            fields = [name for name in ELEMENT_NAMES if name in field_names(owner[0])]
-            lists = [[child(element, name) for element in owner] for name in fields]
+            lists = [child_of_each(owner, name) for name in ELEMENT_NAMES]
         else:
             fields = [*NAMES_FIRST, *(name for name in field_names(owner) if name not in NAMES_FIRST)]
             lists = [child(owner, name) for name in fields if name in field_names(owner)]

@@ -218,9 +218,10 @@ def _rate(
 ) -> tuple[float | None, str, str]:
     """Return Hz, what states it, and the key of times whose unit is clear; empty where there is none."""
     stated, holder = _stated_rate(group, said)
-    key = next(
-        (key for key, info in keys.items() if info.kind == "vector" and is_times(key, info.shape)), None
-    )
+    counts = {key: info.count for key, info in keys.items() if info.count}
+    rows = _length(counts)  # times of another sensor may lie beside those of the frames
+    near = [key for key, count in counts.items() if abs(count - rows) <= 1 and keys[key].kind == "vector"]
+    key = next((key for key in near if is_times(key, keys[key].shape)), None)
     if key is None:
         return stated, holder, ""
     buffer = numbers(group, key, where).reshape(-1)

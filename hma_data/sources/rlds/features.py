@@ -176,10 +176,11 @@ class Steps:
         return blobs
 
     def text(self, key: str) -> str:
-        """Return the first text of a key; empty where the steps have none."""
-        name = f"{self.features[key].name}/ragged_flat_values"
-        blobs = self.example.blobs(name) if name in self.example else self.blobs(key)
-        return blobs[0].decode(errors="replace") if blobs else ""
+        """Return the first text of a key, which may have several a step; empty where the steps have none."""
+        name = self.features[key].name
+        ragged = f"{name}/ragged_flat_values"
+        blobs = self.example.blobs(ragged if ragged in self.example else name)
+        return next(filter(None, blobs), b"").decode(errors="replace")
 
     def decoder(self, key: str) -> Decode:
         """Return a function that maps a step to the image (H, W, 3) of a key."""

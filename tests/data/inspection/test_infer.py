@@ -337,6 +337,7 @@ def test_other_hdf5_takes_rate_and_times_from_the_recording(tmp_path: Path) -> N
         file["teleop/gripper"] = numbers(T)
         file["proprio/joint_position"] = numbers(T, 6)
         file["lidar"] = numbers(5 * T, 3)
+        file["arm/stamps"] = 1_700_000_000.0 + np.arange(5 * T) / 75  # of another sensor
         file["language_instruction"] = "stack the cups"
     values = inferred(path)
     assert values["frequency_hz"] == 15

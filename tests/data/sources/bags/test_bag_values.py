@@ -103,6 +103,7 @@ def test_a_list_of_other_texts_names_nothing() -> None:
     assert value_names([{"values": [1, 2], "joints": ["a"]}], 2) == ()
     assert value_names([{"values": [1, 2], "units": ["rad", "rad"]}], 2) == ()
     assert value_names([{"values": [1, 2]}, {"joint_names": ["a", "b"]}], 2) == ("a", "b")
+    assert value_names([[{"name": "a", "q": 1}, {"q": 2}]], 2) == ()  # JSON may leave some out
 
 
 def motors_bag(path: Path) -> Path:

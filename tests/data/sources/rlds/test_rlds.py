@@ -168,6 +168,16 @@ def test_unpacked_lists_are_read_like_packed_ones():
     assert example.numbers("x").tolist() == [1.5, -2.0]
 
 
+@pytest.mark.parametrize(
+    "texts", [["lift", "raise", "pick up"] * 2, ["", "lift"]], ids=["three a step", "late"]
+)
+def test_of_several_instructions_the_first_counts(tmp_path, texts):
+    steps = STEPS | ({"language_instruction": tensor((3,), "string")} if len(texts) > 2 else {})
+    item = record(0, 2) | {"steps/language_instruction": [text.encode() for text in texts]}
+    folder = write(tmp_path / "d", {"d-train.tfrecord": [item]}, steps)
+    assert read(folder, "train/000000").instruction == "lift"
+
+
 @pytest.mark.parametrize("key", [None, "observation/instruction"])
 def test_an_instruction_kept_as_letter_codes(tmp_path, key):
     steps = STEPS | {
