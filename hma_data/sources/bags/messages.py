@@ -257,7 +257,8 @@ def stamp_ns(message: Any, received_ns: int) -> int:
             continue
         if isinstance(value, int | float):
             times = (round(value * unit) for unit in UNITS_NS if abs(value) < LATEST)  # false for NaN
-            return next((ns for ns in times if abs(ns - received_ns) < DAY_S * SECOND_NS), 0)
+            near = min(DAY_S * SECOND_NS, received_ns / 1000)  # so that one unit fits at most
+            return next((ns for ns in times if abs(ns - received_ns) < near), 0)
         for names in TIME_FIELDS:
             try:
                 seconds, nanoseconds = (child(value, name) for name in names)

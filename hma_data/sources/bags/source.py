@@ -278,9 +278,9 @@ class _EpisodeReading:
         return chain.from_iterable(parts)
 
     def _hear(self, log_ns: int, text: str) -> None:
-        """Keep the first instruction; in an episode inside a bag, the one nearest to its beginning."""
+        """Keep the first instruction in words; of an episode inside a bag, the nearest to its beginning."""
         if self._segment is None:
-            self._said = self._said or (log_ns, text)
+            self._said = self._said or ((log_ns, text) if text else None)
         elif text and log_ns <= self._segment.last_ns:
             begins, before = self._segment.first_ns, self._said
             if before is None or abs(log_ns - begins) < abs(before[0] - begins):

@@ -167,6 +167,7 @@ def test_a_stamp_may_be_one_number_near_receipt(unit: int) -> None:
     received = 1_700_000_000_250_000_000
     for number in (received // unit, received / unit):
         assert abs(stamp_ns({"timestamp": number}, received + 10**9) - received) < max(unit, 10**3)
+    assert stamp_ns({"timestamp": 5 * 10**6}, 7 * 10**9) == 0  # in a simulation's first seconds any unit fits
     for number in (5 * 10**9, math.nan, math.inf, True):  # microseconds since the robot was switched on
         assert stamp_ns({"timestamp": number}, received) == 0
 

@@ -151,7 +151,7 @@ def numbers_bag(tmp_path: Path) -> Path:
                 "/cmd": twist(vector(i, 1, 2), vector(3, 4, 5)),
                 "/cmd.linear": vector(-i, -1, -2),
                 "/cam": image(header, 2, 2, "mono8", 0, 2, np.full(4, i, np.uint8)),
-                "/text": store.types["std_msgs/msg/String"]("pick the cube"),
+                "/text": store.types["std_msgs/msg/String"]("pick the cube" if i else ""),
                 "/joints": joint_state(header, ["a", "b"], np.array([i, 10.0]), none, none),
             }
             for topic, value in values.items():
