@@ -96,7 +96,7 @@ def test_an_index_outside_is_an_index_error(video: Path) -> None:
     ],
     ids=["left-right", "upside down", "half a turn", "across"],
 )
-def test_a_file_that_says_it_is_mirrored_is_shown_so(tmp_path: Path, matrix: Any, shown: Any) -> None:
+def test_a_file_that_says_it_is_mirrored_is_shown_so(tmp_path, matrix, shown) -> None:
     path = encode(tmp_path / "v.mp4", [20, 21])
     plain = VideoFile(path).frames([0])[0]
     np.testing.assert_array_equal(VideoFile(turn(path, matrix)).frames([0])[0], shown(plain))
