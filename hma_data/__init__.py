@@ -1,7 +1,7 @@
 """Convert recordings of any robot to tokenized parquet shards, and read them in training.
 
-The packages in the order of the road: storage, hub, registry, episodes, sources, tokenizers, shards,
-inspection, conversion, loading; beside them lab, bench and cli. A package imports only from those before it.
+The packages, in the order of the data: storage, hub, registry, episodes, sources, tokenizers, shards,
+inspection, conversion, loading, lab and cli. A package imports only from those before it.
 The names below are imported on use, so that `import hma_data` costs nothing.
 """
 

@@ -129,10 +129,10 @@ class HMAConfig:
     conditioning: tuple[str, ...] = ("modulation",)  # any of modulation, concat, add, cross_attention
     shared_modulation: bool = False  # False: modulation weights per embodiment (paper); True: in the trunk
     action_tokens: int = 1  # copies of the action embedding appended to a frame's tokens (concat)
-    # The conditioning of a pass without any actions. "embedding": a learned embedding replaces each action;
-    # "skip": no conditioning (released); "tokens": only learned action tokens (released, actions predicted
-    # too). With "tokens", a single hidden chunk is hidden only in the action tokens; modulation still sees
-    # it, as in the released code.
+    # What conditions a pass without actions. "embedding": a learned embedding for each action; "skip":
+    # nothing (released); "tokens": only learned action tokens (released, if actions are predicted too).
+    # If only some chunks are hidden, "tokens" hides them in the action tokens, but modulation still sees
+    # them (released).
     absent_action: str = "embedding"
     # Octaves of sines and cosines of each action value, added to the stem's input for higher resolution. The
     # longest wave is 8 standard deviations of the value.
@@ -155,13 +155,13 @@ class HMAConfig:
     label_smoothing: float = 0.01  # of the cross-entropy of digits
     # Each sample's corruption is drawn from U(0, corrupt_max): the share of digits replaced at random.
     corrupt_max: float = 0.2
-    # continuous: the noise in a visible frame has the standard deviation latent_noise × corruption
+    # continuous: noise on visible frames; its standard deviation is latent_noise × corruption
     latent_noise: float = 0.0
-    told_noise: bool = False  # each frame's corruption is an input; 0 after training
-    # The share of samples whose longer history stays unmasked, with later frames corrupted more.
+    told_noise: bool = False  # the network is told each frame's corruption; 0 after training
+    # Share of samples of which several first frames stay unmasked; later frames are corrupted more.
     history_probability: float = 0.2
     # The frames of a training pass that predicts video. "window": the window's frames, masked (paper).
-    # "pairs": the recorded frames, and masked copies from the second on that attend to earlier recorded ones.
+    # "pairs": the recorded frames, and a masked copy of each but the first, which attends to those before.
     training_pass: str = "window"
     whole_share: float = 0.5  # pairs: the share of fully masked copies
     crop: int = 0  # U-Net: train on squares of frames of this side, in tokens; 0: on whole frames

@@ -172,7 +172,7 @@ def test_a_target_above_the_recorded_rate_is_noted(tmp_path: Path) -> None:
     path.write_text(path.read_text().replace("target_hz: 40", "target_hz: 40\nstride: 4"))
     facts = json.loads(hma("registry", "validate", str(path), "--json").stdout)
     assert facts["problems"] == [] and facts["notes"][0]["file"] == str(path)
-    assert facts["notes"][0]["note"].endswith("sees 2.5 frames a second with the stride 4 that is given")
+    assert facts["notes"][0]["note"].endswith("sees 2.5 frames per second with the stride 4 that is given")
 
 
 def test_a_warning_is_one_line_without_its_place_in_the_code() -> None:

@@ -92,7 +92,7 @@ def convert(
         raise UsageError("--source", f"says {source}, DATA says {data}", "name the recording once")
     source = data if source is None else source
     if options.extend and options.overwrite:
-        raise UsageError("hma convert", "--extend keeps what --overwrite deletes", "give one of them")
+        raise UsageError("hma convert", "--extend keeps the set, --overwrite deletes it", "give one of them")
     if options.to == "lerobot" and (tokenizer != TOKENIZER or weights):
         fault = "a LeRobotDataset holds frames as recorded, not tokens"
         raise UsageError("--to lerobot", fault, "leave out --tokenizer and --weights")

@@ -142,12 +142,12 @@ def registry_validate(
 
 
 def _notes(judged: "list[RegistryEntry]") -> Iterator[tuple[Path, str]]:
-    """Yield path and note of the YAMLs that want more frames a second than were recorded."""
+    """Yield path and note of the YAMLs that want more frames per second than were recorded."""
     for entry in judged:
         facts = entry.facts or {}
         target, rate, stride = (facts.get(name) for name in ("target_hz", "rate_hz", "stride"))
         if target and rate and target > rate and target != 2:  # 2 is the default, which nobody chose
-            sees = f"the model sees {rate / (stride or 1):.4g} frames a second"
+            sees = f"the model sees {rate / (stride or 1):.4g} frames per second"
             given = f" with the stride {stride} that is given" if stride and stride > 1 else ""
             yield entry.path, f"target_hz {target:g} is above the recorded rate: {sees}{given}"
 

@@ -70,7 +70,7 @@ def _print_info(facts: dict[str, Any]) -> None:
     say(
         f"{human_count(totals['episodes'], 'episode')}, {totals['frames']:,} frames at "
         f"{robot['rows_hz']:g} Hz ({lasting}), {human_bytes(totals['bytes'])} in "
-        f"{human_count(facts['shards'], 'shard')} ({facts['bytes_per_frame']:.0f} bytes a frame)"
+        f"{human_count(facts['shards'], 'shard')} ({facts['bytes_per_frame']:.0f} bytes per frame)"
     )
     say(f"cameras: {robot['cameras_line']}")
     say(
@@ -233,7 +233,7 @@ def shards_split(
     ] = None,
     seed: Annotated[int, Option(help="Seed of the split.")] = 0,
     by: Annotated[
-        Literal["episode", "instruction", "source"], Option(help="What stays together in one split.")
+        Literal["episode", "instruction", "source"], Option(help="What is never divided between splits.")
     ] = "episode",
     workers: Workers = None,
     json: Json = False,

@@ -237,7 +237,7 @@ def differences(mine: dict[str, Any], theirs: dict[str, Any]) -> str:
         "cameras": "cameras",
         "camera_columns": "columns of the cameras",
         "frames": "--frames",
-        "frame_stride": "recorded steps a row, with --frames strided the YAML's stride",
+        "frame_stride": "recorded steps per row (with --frames strided, the YAML's stride)",
         "recording": "recordings",
     }
     found = []

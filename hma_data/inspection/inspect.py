@@ -411,7 +411,7 @@ def _times(clips: list[Clip], robot: Embodiment) -> Iterator[Finding]:
         said = f"the aligned frames have {hz:.3g} Hz, the YAML says {robot.rate_hz:g}"
         yield Finding("rate", "error", said, rate_remedy(robot))
     if hz and (steps > 3 / hz).any():
-        said = f"frames pause for up to {steps.max():.3g} s; windows cross no pause of a model step or longer"
+        said = f"frames pause for up to {steps.max():.3g} s; no window crosses a pause of a model step or longer"
         yield Finding("gaps", "warn", said, pause_remedy(robot, hz))
     needed = WINDOW * robot.stride  # the chunk of the last frame too
     lengths = sorted(len(clip) for clip in clips)
@@ -419,7 +419,7 @@ def _times(clips: list[Clip], robot: Embodiment) -> Iterator[Finding]:
     if short:
         said = f"{short} of {len(clips)} episodes are shorter than a window, {needed} frames"
         fits = max(lengths[len(lengths) // 10] // WINDOW, 1)  # nine of ten episodes hold a window
-        remedy = f"set a higher target_hz, such as {robot.rate_hz / fits:.3g}, or fewer frames a window"
+        remedy = f"set a higher target_hz, such as {robot.rate_hz / fits:.3g}, or fewer frames per window"
         yield Finding("length", "warn", said, remedy)
     for stream in dict.fromkeys(name for clip in clips for name in clip.skew_ms):
         moved = [clip.skew_ms[stream] for clip in clips if stream in clip.skew_ms]

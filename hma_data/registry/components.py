@@ -190,9 +190,9 @@ class Sync(SpecModel):
     images: Method = Field("nearest", description="alignment of images to the grid")
     actions: Method = Field("hold", description="alignment of actions to the grid")
     states: Method = Field("interpolate", description="alignment of states to the grid")
-    max_skew_ms: Number | None = Field(None, gt=0, description="maximum skew of a sample")
+    max_skew_ms: Number | None = Field(None, gt=0, description="maximum time between a sample and its frame")
     tolerance_ms: Number | None = Field(
-        None, gt=0, description="a held action up to this long after a frame belongs to it"
+        None, gt=0, description="with hold: an action up to this long after a frame belongs to that frame"
     )
     beyond: Literal["refuse", "mask"] = Field(
         "refuse",
@@ -349,7 +349,7 @@ class HandsLayout(SourceLayout):
     max_hold: int | None = Field(
         None, ge=0, description="maximum number of consecutive labelled frames for which a position is held"
     )
-    min_frames: int = Field(12, ge=0, description="runs with fewer frames (with hands) are dropped")
+    min_frames: int = Field(12, ge=0, description="minimum frames with hands in a run; shorter runs are dropped")
     min_score: FiniteFloat = Field(0.5, ge=0, description="labels with a lower score are ignored")
     max_gap_s: FiniteFloat = Field(
         3.0, ge=0, description="maximum gap between labels of a run, in seconds, for irregular labels"

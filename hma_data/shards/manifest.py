@@ -425,7 +425,7 @@ def derive(
         footer = Footer.from_metadata(metadata.metadata, str(folder / name))
         if footer.plan["hash"] not in plan_hashes(plan):
             theirs = footer.plan["hash"]
-            fault = f"is of the plan {theirs}, the set of {plan['hash']}: two jobs wrote here"
+            fault = f"was written under the plan {theirs}, the set under {plan['hash']}: two jobs wrote here"
             remedy = "restart one of them with --overwrite, the other with another --out"
             raise ShardError(folder / name, fault, remedy)
         rows = tuple(group_rows(metadata))

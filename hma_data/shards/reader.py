@@ -102,7 +102,7 @@ class ShardSet:
         except (OSError, pa.ArrowException) as fault:
             raise ShardError(path, f"cannot be read: {fault}", "run the same hma convert again") from fault
         if other := set(table["shard"].unique().to_pylist()) - self.listed.keys():
-            text = f"names {min(map(str, other))!r}, which is no shard of the manifest"
+            text = f"names {min(map(str, other))!r}, which is not a shard of the manifest"
             raise ShardError(path, text, restat_remedy(self.folder))
         return table
 
@@ -295,7 +295,7 @@ def limit_bytes() -> int:
     try:
         return int(float(stated) * 1e9)
     except (ValueError, OverflowError) as fault:
-        text = f"{stated!r} is no number of gigabytes"
+        text = f"{stated!r} is not a number of gigabytes"
         raise UsageError(f"${CACHE_VARIABLE}", text, "give for example 20, or 0 for no cache") from fault
 
 

@@ -135,7 +135,7 @@ class RemotePath(PosixPath):
         try:
             files = file_system(str(self))[0]
         except ValueError as fault:
-            text = f"is of no store that is known: {said(fault)}"
+            text = f"is in no known store: {said(fault)}"
             raise StorageError(str(self), text, "use s3://, gs:// or hf://") from fault
         if self.scheme == "hf" and getattr(files, "named", None) != self._named:
             files.invalidate_cache()  # of this thread: no other thread is reading it

@@ -106,7 +106,7 @@ class Entry:
 
 _MAGVIT2 = Entry(
     "magvit2", "discrete", 256, (16, 16),
-    "the paper's: Open-MAGVIT2 as 1X tuned it to robot video, 18 bits a token",
+    "the paper's: Open-MAGVIT2 as 1X tuned it to robot video, 18 bits per token",
     "download", "hma_data.tokenizers.magvit2", {"averaged": True},
     repo="1x-technologies/worldmodel", repo_type="dataset", file="magvit2.ckpt", bytes=1_150_000_000,
     revision="94b418de3ad6efe100495a45ce82d5d870df6265",
@@ -114,7 +114,7 @@ _MAGVIT2 = Entry(
 _ROWS = (
     Entry(
         "fsq-16", "discrete", 256, (16, 16),
-        "the default: finite scalar quantisation, 18 bits a token, fast on a CPU",
+        "the default: finite scalar quantisation, 18 bits per token, fast on a CPU",
         "embedded", "hma_data.tokenizers.embedded", {"image_size": 256}, file="fsq.safetensors",
     ),
     Entry(
@@ -129,7 +129,7 @@ _ROWS = (
     ),
     Entry(
         "palette-64", "discrete", 64, (32, 32),
-        "a colour per pixel of a short list, 2×2 pixels a token: sharp edges for a convolutional world model",
+        "a colour per pixel of a short list, 2×2 pixels per token: sharp edges for a convolutional world model",
         "embedded", "hma_data.tokenizers.palette", {"image_size": 64, "colors": None},
         file="palette.safetensors",
     ),

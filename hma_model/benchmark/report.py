@@ -44,7 +44,7 @@ PLAIN = (  # key of a robot's figures, measure, key or text of the reference, it
         "calibration.all_px",
         "of all",
     ),
-    ("calibration.right", "share of right warning decisions", "calibration.clock", "by a clock"),
+    ("calibration.right", "share of right warning decisions", "calibration.clock", "at a fixed time"),
     ("calibration.misses", "misses: the error doubles without a prior warning", "", ""),
     ("calibration.false_alarms", "false alarms: no doubling soon after a warning", "", ""),
     ("frames_per_second", "frames per second, one rollout", "frames_per_cpu_second", "per CPU second"),

@@ -123,7 +123,7 @@ def _listen(host: str, port: int) -> socket.socket:
         return socket.create_server((host, port), family=family)
     except (OSError, OverflowError) as fault:
         raise UsageError(
-            f"{host}:{port}", f"cannot be listened on: {fault}", "choose another --host or --port"
+            f"{host}:{port}", f"the server cannot listen there: {fault}", "choose another --host or --port"
         ) from fault
 
 

@@ -191,7 +191,7 @@ def recipe_list(json: Json = False) -> None:
     if json:
         print_json(found)
     else:
-        print_table(["recipe", "steps", "windows a step", "about"], [list(one.values()) for one in found])
+        print_table(["recipe", "steps", "windows per step", "about"], [list(one.values()) for one in found])
 
 
 @recipe_app.command("show")

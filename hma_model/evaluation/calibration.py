@@ -89,9 +89,9 @@ class Meter:
     @property
     def verdict(self) -> str:
         """Return in a sentence how good it is."""
-        rates = f"{self.right:.0%} of rollouts are warned in time, a clock warns {self.clock:.0%}"
+        rates = f"{self.right:.0%} of rollouts are warned in time, at a fixed time {self.clock:.0%}"
         if not self.better:
-            return f"uncertainty may be no better than a clock: {rates}"
+            return f"uncertainty may be no better than a warning at a fixed time: {rates}"
         shares = {"misses": self.misses, "false alarms": self.false_alarms}
         said = [f"{name} {value:.0%}" for name, value in shares.items() if value is not None]
         start = f"uncertainty warns of a state error of {self.doubled_px:.1f} px: {rates}"

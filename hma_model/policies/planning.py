@@ -242,6 +242,6 @@ def read_planning(words: str, scenes: Scenes, world: World | None) -> Planning:
     solver_of(kind)
     if world is None:
         raise HMAError(
-            f"policy plan:{words}", "has no world to plan in", "give it to hma policy-eval or augment"
+            f"policy plan:{words}", "has no world model to plan in", "give it to hma policy-eval or augment"
         )
     return Planning(world, scenes, kind, **options)

@@ -134,7 +134,7 @@ def _conditioning(network: str) -> tuple[str, ...]:
     elif "modulate" in network:
         found.append("modulation")
     if not found:
-        fault = f"action_network {network!r} uses actions in no way that is known"
+        fault = f"action_network {network!r} uses actions in an unknown way"
         raise CheckpointError(_WHERE, fault, "known are mlp, modulate, concat and concat+modulate")
     return tuple(found)
 

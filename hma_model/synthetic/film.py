@@ -89,7 +89,7 @@ def read_film(world: World, place: StrPath, embodiment: str, hz: float) -> list[
         rows_hz = found.embodiment.rate_hz / found.manifest.frame_stride
         step = max(1, round(rows_hz / hz))
         if abs(rows_hz / step / hz - 1) > RATE_TOLERANCE:
-            fault = f"has {rows_hz:g} frames a second; the model takes {hz:g}"
+            fault = f"has {rows_hz:g} frames per second; the model takes {hz:g}"
             remedy = "convert the video with --frames all, or at a multiple of the model's rate"
             raise UsageError(path, fault, remedy)
         return ShardFilm(world, found, step, embodiment).episodes()

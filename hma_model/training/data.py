@@ -29,7 +29,7 @@ def share(recipe: Recipe, ranks: int) -> tuple[int, int]:
     total = recipe.windows_per_step
     passes = recipe.accumulate if recipe.accumulate % ranks == 0 else ranks
     if total % passes:
-        fault = f"{total} windows a step cannot be shared evenly by {ranks} ranks"
+        fault = f"{total} windows per step cannot be shared evenly by {ranks} ranks"
         remedy = (
             f"choose batch_size × accumulate as a multiple of {ranks}, such as {-(-total // ranks) * ranks}"
         )
@@ -62,7 +62,7 @@ class TrainData:
         self._batches: list[Iterator[Batch]] = []
         count = sum(self.mixture.counts)
         if recipe.windows_per_step > count:
-            fault = f"{recipe.windows_per_step} windows a step are more than the {count} there are"
+            fault = f"{recipe.windows_per_step} windows per step are more than the {count} there are"
             raise RecipeError("recipe: batch_size", fault, "lower batch_size or accumulate, or add data")
         self._data += [self._dataset(recipe, sets, size, number) for number in self.own[1:]]
 
@@ -128,7 +128,7 @@ class TrainData:
         """
         kept = state["passes"]
         if len(kept) != self.passes:
-            return f"its state has {len(kept)} passes a step, this run has {self.passes}"
+            return f"its state has {len(kept)} passes per step, this run has {self.passes}"
         try:
             for number, data in zip(self.own, self._data):
                 data.load_state_dict(kept[number])

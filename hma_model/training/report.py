@@ -29,7 +29,7 @@ RECENT = 50  # number of last steps over which the closing figures are averaged
 RATES = {  # key of a line -> what it is, and whether its axis is logarithmic
     "lr": ("learning rate", False),
     "grad_norm": ("gradient's norm", True),
-    "step_seconds": ("seconds a step", False),
+    "step_seconds": ("seconds per step", False),
 }
 
 Line = dict[str, Any]  # of metrics.jsonl
@@ -107,9 +107,9 @@ def _headline(
         (_short(_mean(losses)) if losses else "", f"training loss, {main}, last {len(recent)} steps"),
         (_short(last.get("loss")), "held-out loss"),
         (_short(last.get("baseline")), "held-out loss of the token frequencies"),
-        (f"{pace:.1f}", "windows a second"),
+        (f"{pace:.1f}", "windows per second"),
         (human_seconds(rates["step_seconds"][:, 1].sum()), "spent in steps"),
-        (f"{rates['memory_mib'][:, 1].max():,.0f} MiB", "of memory at most"),
+        (f"{rates['memory_mib'][:, 1].max():,.0f} MiB", "peak memory"),
         (f"{recent[-1].get('skipped', 0)}", "steps skipped"),
     ]
     page.figures([tile for tile in tiles if tile[0]])

@@ -194,7 +194,7 @@ class Run:
         if self.start and not self.step:
             self.notes += self.start.remarks(self.sets)
         if self.ranks.size > 1:
-            passes = f"{self.train_data.passes} passes a step over {self.ranks.size} ranks"
+            passes = f"{self.train_data.passes} passes per step over {self.ranks.size} ranks"
             self.notes.append(f"{passes}, {recipe.parallel}")
 
     @torch.no_grad()

@@ -45,7 +45,7 @@ def view_run(out: StrPath, window: int = 0, data: Sequence[StrPath] = ()) -> Vie
     figures = kept.points()
     if data and shards is None:
         names = ", ".join(checkpoint.embodiments)
-        raise UsageError(data[0], f"is of no robot of the checkpoint, which has: {names}")
+        raise UsageError(data[0], f"has a robot that is not in the checkpoint, which has: {names}")
     if shards is None and not figures:
         raise UsageError(out, "has no metrics.jsonl and none of its shards are here", "name a shard set too")
     if shards is None:

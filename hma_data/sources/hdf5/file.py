@@ -423,7 +423,7 @@ def dataset(group: h5py.Group, key: str, where: str) -> h5py.Dataset:
     if is_elsewhere(found, group):
         raise EpisodeError(where, f"{key!r} keeps its values in other files", "write them into this one")
     if not found.shape:
-        raise EpisodeError(where, f"{key!r} is a single value, not one value a frame")
+        raise EpisodeError(where, f"{key!r} is a single value, not one value per frame")
     if not found.shape[0]:
         raise EpisodeError(where, f"{key!r} is empty")
     if not is_plausible(found):

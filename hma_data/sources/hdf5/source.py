@@ -240,7 +240,7 @@ def _times(
     values = numbers(group, key, where)
     values = values[: recorded.of(len(values))]
     if values.dtype.kind not in "fiu" or values.size != len(values):
-        raise EpisodeError(where, f"{key!r} holds {values.shape} {values.dtype}, not a time a frame")
+        raise EpisodeError(where, f"{key!r} holds {values.shape} {values.dtype}, not one time per frame")
     times = values.reshape(-1)
     unit = seconds_a_unit(np.unique(times), key)
     found = measured_hz(np.diff(times)) if len(times) > 2 else None

@@ -205,7 +205,7 @@ def _instruction(meta: Metadata, rows: Rows, key: str | None, tasks: list[str]) 
     said = rows.column(key)[0].as_py()
     if isinstance(said, int):  # GR00T: the annotations are numbers of tasks
         if said not in meta.tasks:
-            raise EpisodeError(rows.path, f"{key!r} is {said}, the number of no task")
+            raise EpisodeError(rows.path, f"{key!r} is {said}, which is not the index of a task")
         said = meta.tasks[said]
     return str(said or "")
 
@@ -359,7 +359,7 @@ class _Looking:
             said = f"{path} {found.fault}"
             self._survey.note(Finding("frames", "warn", said, found.remedy, key, numbers))
         elif found.shift:
-            said = f"{path} begins {found.shift:+.3f} s from where its metadata says, with one frame a row"
+            said = f"{path} begins {found.shift:+.3f} s from where its metadata says, with one frame per row"
             self._survey.note(Finding("frames", "info", said, key=key, numbers=numbers))
 
 

@@ -243,7 +243,7 @@ def _numbers(value: Any, path: Path, key: str, lists: bool = False) -> Array:
         raise EpisodeError(path, f"{key} holds {type(value).__name__} values, not numbers")
     found = np.asarray(value)
     if found.size > MAX_WIDTH and not lists:
-        raise EpisodeError(path, f"{key} has {found.size:,} values a sample, more than {MAX_WIDTH:,}")
+        raise EpisodeError(path, f"{key} has {found.size:,} values per sample, more than {MAX_WIDTH:,}")
     return found
 
 

@@ -218,7 +218,7 @@ class Steps:
                 said = f"{feature.name} has {len(lengths)} rows for {math.prod(sizes)}"
                 raise EpisodeError(self.name, said)
             if len(lengths) and (lengths != lengths[0]).any():
-                said = f"{feature.name} varies from {lengths.min()} to {lengths.max()} entries a step"
+                said = f"{feature.name} varies from {lengths.min()} to {lengths.max()} entries per step"
                 raise EpisodeError(self.name, said)
             sizes.append(int(lengths[0]) if len(lengths) else 0)
         return f"{feature.name}/ragged_flat_values", sizes

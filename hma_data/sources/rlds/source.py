@@ -218,7 +218,7 @@ def _check_component(folder: RldsFolder, part: Component) -> None:
         raise SourceError(folder.uri, f"{part.key} is {_described(feature)} of {feature.dtype}, not numbers")
     wanted = part.slice[1] if part.slice else part.dims
     if feature.width is not None and (feature.width < wanted or (not part.slice and feature.width > wanted)):
-        fault = f"{part.key} has {feature.width} values a step, the embodiment says {wanted}"
+        fault = f"{part.key} has {feature.width} values per step, the embodiment says {wanted}"
         raise SourceError(folder.uri, fault, "correct dims or give slice in the YAML")
 
 
@@ -245,7 +245,7 @@ def _text_feature(folder: RldsFolder, key: str) -> RldsFeature:
 
 def _described(feature: RldsFeature) -> str:
     if feature.kind == "image":
-        return "a sequence of images a step" if len(feature.nesting) > 1 else "an image"
+        return "a sequence of images per step" if len(feature.nesting) > 1 else "an image"
     return {"number": "a tensor", "text": "text"}.get(feature.kind, "a feature")
 
 

@@ -305,7 +305,7 @@ function showStart() {
   const hint = $("start"), touch = matchMedia("(pointer: coarse)").matches;
   hint.hidden = !paused || !world;
   if (hint.hidden) return;
-  if (frame) return hint.replaceChildren(touch ? "Paused: tap Run" : "Paused: Run or P goes on");
+  if (frame) return hint.replaceChildren(touch ? "Paused: tap Run" : "Paused: Run or P continues");
   if (touch) return hint.replaceChildren("Drag here to drive");
   hint.replaceChildren(...robot.keys.flat().slice(0, 4).map(cap), robot.pads.length ? " or drag here to drive" : " drive");
 }

@@ -115,7 +115,7 @@ def test_a_card_says_what_its_losses_are_of() -> None:
     config: dict[str, Any] = {"model": {"kind": "discrete", "merge": 2}, "tokenizer": {}}
     cards = {"arm": {"metrics": {"val_loss": 7.1, "baseline_loss": 12.5}}}
     text = render(config, cards).decode()
-    assert "Val loss: nats a square of 2×2 tokens" in text
+    assert "Val loss: nats per square of 2×2 tokens" in text
     assert "Baseline loss" not in render(config, {"arm": {"metrics": {"val_loss": 7.1}}}).decode()
 
 

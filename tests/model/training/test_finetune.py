@@ -158,7 +158,7 @@ CODED = TokenizerSpec(**{**SPEC.to_json(), "name": "coded", "weights_sha256": "a
         ("leg", {}, ("digits=64",), RecipeError, r"gives digits of \(64,\), the checkpoint has \(8, 8\)"),
         ("leg", {}, ("model.layers=3",), RecipeError, r"model\.layers"),
         ("leg", {}, ("mixture.weights.lag=2",), RecipeError, r"mixture\.weights"),
-        ("leg", {}, ("batch_size=900",), RecipeError, "900 windows a step"),
+        ("leg", {}, ("batch_size=900",), RecipeError, "900 windows per step"),
     ],
 )
 def test_what_does_not_fit_the_checkpoint_is_refused_and_leaves_no_folder(

@@ -86,7 +86,7 @@ def test_two_ranks_give_the_curve_and_the_weights_of_one(recipe, alone, tmp_path
     told = spread(recipe(parallel=mode), tmp_path / "run")
     assert curve(tmp_path / "run") == pytest.approx([loss for _, loss in alone.losses], rel=1e-4), told
     close(alone.checkpoint, resolve(tmp_path / "run"))
-    assert f"4 passes a step over 2 ranks, {mode}" in told
+    assert f"4 passes per step over 2 ranks, {mode}" in told
     assert json.loads((tmp_path / "run" / "environment.json").read_text())["ranks"] == 2
 
 
@@ -113,7 +113,7 @@ def test_a_step_shared_otherwise_goes_on_with_windows_anew_and_says_so(recipe, t
     given = recipe(accumulate=1, batch_size=4)
     train_until(given, tmp_path / "run", 3)
     told = spread(given, tmp_path / "run")
-    assert "the sampler restarts: " in told and "has 1 passes a step, this run has 2" in told
+    assert "the sampler restarts: " in told and "has 1 passes per step, this run has 2" in told
     assert len(curve(tmp_path / "run")) == 6
 
 

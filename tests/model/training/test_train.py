@@ -182,13 +182,13 @@ def test_two_trainings_in_one_folder_are_refused(recipe, tmp_path):
     [
         ({"data": []}, RecipeError, "names no shards"),
         ({"data": ["nowhere"]}, ShardError, "nowhere"),
-        ({"batch_size": 1000}, RecipeError, r"1000 windows a step are more than the \d+ there are"),
+        ({"batch_size": 1000}, RecipeError, r"1000 windows per step are more than the \d+ there are"),
         ({"frames": 20}, ShardError, "no window of 20 frames"),
         ({"device": "cuda:99"}, RecipeError, "this machine has no cuda:99"),
         ({"model": {"width": 15, "heads": 2}}, RecipeError, "heads"),
         ({"mixture": {"weights": {"leg": 2}}}, RecipeError, r"recipe: mixture\.weights: name leg.* has arm"),
         ({"mixture": {"weights": {"arm": 0, "hand": 0}}}, RecipeError, r"mixture\.weights: leave nothing"),
-        ({"accumulate": 1_000_000_000}, RecipeError, r"4000000000 windows a step are more"),
+        ({"accumulate": 1_000_000_000}, RecipeError, r"4000000000 windows per step are more"),
         ({"model": {"width": 131_072, "layers": 9}}, RecipeError, "memory: needs about .* GiB are free"),
     ],
 )

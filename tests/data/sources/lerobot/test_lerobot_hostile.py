@@ -75,7 +75,7 @@ ONE: dict[str, Row] = {  # one episode is refused
     "subtasks of NaN": (column("subtask_index", [float("nan")] * 12), "not as lerobot writes it: ValueError"),
     "words of no task": (
         column("frame_index", [*range(7, 19)]),
-        "'frame_index' is 7, the number of no task",
+        "'frame_index' is 7, which is not the index of a task",
         TOLD_BY_NUMBER,
     ),
     "pictures elsewhere": (column(STILL, [{"path": "../../etc/passwd"}] * 12), "outside the dataset", STILLS),

@@ -155,7 +155,7 @@ def test_inspect_tells_of_a_key_of_varying_length_as_a_finding(tmp_path, caplog,
     folder = write(tmp_path / "d", {"d-train.tfrecord": [record(0, 2) | stored]}, steps)
     told = [one for one in RLDS.inspect(str(folder)).findings if one.key == "found"]
     assert [(one.check, one.severity) for one in told] == [("rows", "info")]
-    assert "found varies from 0 to 3 entries a step" in told[0].message
+    assert "found varies from 0 to 3 entries per step" in told[0].message
     assert not caplog.records and capsys.readouterr().err == ""
 
 

@@ -91,7 +91,7 @@ ALL: dict[str, Row] = {  # no episode can be used
     "zeros": (of(SHARD, whole(bytes(400))), "holds no readable episode"),
     "nothing": (shutil.rmtree, "does not exist"),
     "no such key": (untouched, "no key 'action/mov'.*did you mean action/move", acts("action/mov", 2)),
-    "another width": (untouched, "state has 3 values a step, the embodiment says 7", WIDE),
+    "another width": (untouched, "state has 3 values per step, the embodiment says 7", WIDE),
     "text": (untouched, "text is text of string, not numbers", acts("text", 1)),
     "numbers": (untouched, "action/move is a tensor of float32, not a colour image", sees("action/move")),
     "depth": (untouched, "depth is an image of uint16, not a colour image", sees("depth")),

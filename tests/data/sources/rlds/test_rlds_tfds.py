@@ -112,7 +112,7 @@ def test_a_sequence_of_varying_length_is_refused_or_equal(written, truth):
     for name, episode in each(truth):
         rows = [step["ragged"].numpy() for step in episode["steps"]]
         if len({len(row) for row in rows}) > 1:
-            with pytest.raises(EpisodeError, match="varies from 0 to 2 entries a step"):
+            with pytest.raises(EpisodeError, match="varies from 0 to 2 entries per step"):
                 ours(written, name).numbers("ragged")
         else:
             np.testing.assert_array_equal(ours(written, name).numbers("ragged"), rows)
