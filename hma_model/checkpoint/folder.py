@@ -264,7 +264,7 @@ def _best(embodiments: list[str], tokenizer: str | None) -> Path:
         fault = f"{where}: no network has all of them"
         raise CheckpointError(EMBEDDED_NAME, fault, "name robots of one network")
     if tokenizer is not None:
-        of = {f: parse_config(read_json(f / CONFIG), f / CONFIG).tokenizer["name"] for f in shared}
+        of = {f: Checkpoint.open(f).config.tokenizer["name"] for f in shared}
         shared = [folder for folder in shared if of[folder] == tokenizer] or shared
     return shared[-1] if shared and embodiments else (shared or [*BUNDLED.values()])[0]
 
@@ -336,7 +336,7 @@ def _own_colors(config: HMAConfig) -> str:
         if config.tokenizer["colors"] == get_spec(str(config.tokenizer["name"])).colors:
             return ""
     for folder in BUNDLED.values():
-        if parse_config(read_json(folder / CONFIG), folder / CONFIG).tokenizer == config.tokenizer:
+        if Checkpoint.open(folder).config.tokenizer == config.tokenizer:
             return f" --weights {folder / CONFIG}"
     return f" --weights PATH, the path of the model's {CONFIG}"
 

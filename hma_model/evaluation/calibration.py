@@ -18,6 +18,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from pydantic import FiniteFloat, TypeAdapter
 from scipy.optimize import isotonic_regression
 
 from hma_model.arrays import Bools, Floats, Ints
@@ -53,30 +54,25 @@ class Meter:
     """
 
     unmask_steps: int
-    temperature: float
-    stated: tuple[float, ...]
-    error_px: tuple[float, ...]
-    limit: float
-    doubled_px: float
-    right: float
-    clock: float
-    misses: float | None
-    false_alarms: float | None
+    temperature: FiniteFloat
+    stated: tuple[FiniteFloat, ...]
+    error_px: tuple[FiniteFloat, ...]
+    limit: FiniteFloat
+    doubled_px: FiniteFloat
+    right: FiniteFloat
+    clock: FiniteFloat
+    misses: FiniteFloat | None
+    false_alarms: FiniteFloat | None
     better: bool
     chooses: bool
 
     @classmethod
     def of(cls, facts: Mapping[str, Any]) -> "Meter":
-        """Return the meter of the values of `facts`; KeyError, TypeError or ValueError if they are none."""
-        own = {name: facts[name] for name in cls.__dataclass_fields__}
-        curve = np.array([own["stated"], own["error_px"]], np.float64)
-        own |= {name: float(own[name]) for name in ("temperature", "limit", "doubled_px", "right", "clock")}
-        own |= {name: own[name] and float(own[name]) for name in ("misses", "false_alarms")}
-        numbers = [value for value in own.values() if isinstance(value, float)]
-        sound = np.isfinite(curve).all() and np.isfinite(numbers).all() and (np.diff(curve) >= 0).all()
-        if not (sound and curve.size):
-            raise ValueError(f"no meter: {dict(facts)}")
-        return cls(**own | {name: tuple(own[name]) for name in ("stated", "error_px")})
+        """Return the meter of the values of `facts`; ValueError if they are none."""
+        found = TypeAdapter(cls).validate_python(facts)
+        if not found.stated or (np.diff([found.stated, found.error_px]) < 0).any():
+            raise ValueError("the errors to expect do not grow with the stated uncertainty")
+        return found
 
     def expected(self, stated: Floats) -> Floats:
         """Return the state error in px to expect at stated uncertainties (…); beyond the last, it is more."""
@@ -111,7 +107,7 @@ def meter_of(
         return None, "uncertainty is not calibrated: hma benchmark calibrates it"
     try:
         meter = Meter.of(card["meter"])
-    except (KeyError, TypeError, ValueError):
+    except ValueError:
         return None, "the card's calibration of uncertainty is damaged: hma benchmark rebuilds it"
     drawn = (meter.unmask_steps, "random") == (unmask_steps, order) or config.whole_frames  # of one pass
     if meter.temperature != temperature or not drawn:
