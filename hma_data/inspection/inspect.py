@@ -411,7 +411,7 @@ def _times(clips: list[Clip], robot: Embodiment) -> Iterator[Finding]:
         said = f"the aligned frames have {hz:.3g} Hz, the YAML says {robot.rate_hz:g}"
         yield Finding("rate", "error", said, rate_remedy(robot))
     if hz and (steps > 3 / hz).any():
-        said = f"frames pause for up to {steps.max():.3g} s; no window crosses a pause of a model step or longer"
+        said = f"frames pause for up to {steps.max():.3g} s; no window crosses pauses of a model step or more"
         yield Finding("gaps", "warn", said, pause_remedy(robot, hz))
     needed = WINDOW * robot.stride  # the chunk of the last frame too
     lengths = sorted(len(clip) for clip in clips)

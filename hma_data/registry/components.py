@@ -349,7 +349,7 @@ class HandsLayout(SourceLayout):
     max_hold: int | None = Field(
         None, ge=0, description="maximum number of consecutive labelled frames for which a position is held"
     )
-    min_frames: int = Field(12, ge=0, description="minimum frames with hands in a run; shorter runs are dropped")
+    min_frames: int = Field(12, ge=0, description="minimum frames with hands in a run; others are dropped")
     min_score: FiniteFloat = Field(0.5, ge=0, description="labels with a lower score are ignored")
     max_gap_s: FiniteFloat = Field(
         3.0, ge=0, description="maximum gap between labels of a run, in seconds, for irregular labels"

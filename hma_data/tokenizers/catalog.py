@@ -129,7 +129,7 @@ _ROWS = (
     ),
     Entry(
         "palette-64", "discrete", 64, (32, 32),
-        "a colour per pixel of a short list, 2×2 pixels per token: sharp edges for a convolutional world model",
+        "each pixel one of up to 255 colours, 2×2 pixels per token: sharp edges, for convolutional models",
         "embedded", "hma_data.tokenizers.palette", {"image_size": 64, "colors": None},
         file="palette.safetensors",
     ),

@@ -135,7 +135,7 @@ class Recipe(_Settings):
         "like", description="with start: initialise a new stem from a similar robot's, or fresh"
     )
     # a token's digits: the tokenizer's, or split into this many values (FSQ's levels) or joined up to them
-    digits: Count = Field(0, ge=0, description="values per digit: 8 splits 512 into 8 · 8 · 8, 512 joins; 0: the tokenizer's")
+    digits: Count = Field(0, ge=0, description="values per digit: 8 (splits 512) or 512; 0: as the tokenizer")
     # model.merge or model.patch, unless the recipe gives it, is the least that leaves so few
     places: Count = Field(0, ge=0, description="maximum trunk tokens per camera frame; 0: no limit")
 

@@ -273,7 +273,7 @@ def test_rows_of_another_stride_are_refused_and_nothing_is_touched(toy_recording
     out, settings = tmp_path / "out", replace(SMALL, frames="strided")
     run(robot(), toy_recording, out, settings)
     before = contents(out)
-    said = r"different: recorded steps per row \(with --frames strided, the YAML's stride\) \(2 there, 10 now\) — "
+    said = r"recorded steps per row \(with --frames strided, the YAML's stride\) \(2 there, 10 now\) — "
     for options in ({}, {"extend": True}):
         with pytest.raises(OutputError, match=said):
             run(robot(1), toy_recording, out, settings, **options)

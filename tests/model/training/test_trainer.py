@@ -172,7 +172,7 @@ def test_a_step_is_the_same_windows_on_any_number_of_ranks(recipe, batch, accumu
 
 
 def test_windows_that_cannot_be_shared_are_refused(recipe):
-    with pytest.raises(RecipeError, match="9 windows per step cannot be shared evenly by 2 ranks.*such as 10"):
+    with pytest.raises(RecipeError, match="9 windows per step cannot be shared evenly by 2 ranks.*as 10"):
         share(recipe(batch_size=9), 2)
 
 
