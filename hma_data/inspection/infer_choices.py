@@ -54,6 +54,7 @@ GIVEN_WORDS = _set("go start src box delta")  # poses that are given, not measur
 SIDES = _set("left right l r")
 _GRIPPER = _set("gripper grippers grip closedness close closed open finger fingers")
 _WHOLE_STATE = re.compile(r"(robot_)?(state|proprio|proprioception|obs)|qpos|agent_pos")
+_OTHER_NUMBERS = re.compile(r"_(cos|sin|currents|current_values?)$")  # amperes, of AgiBot's joints
 _OBSERVED = re.compile(r"(^|[/.])(obs|observations?)([/.]|$)", re.IGNORECASE)
 _NEXT = re.compile(r"(^|[/.])next([_./]|$)", re.IGNORECASE)
 
@@ -113,7 +114,7 @@ def vectors(keys: Iterable[KeyInfo]) -> list[KeyInfo]:
     return [
         key
         for key in numbers
-        if not NOISE & set(words(key.key)) and _snake(key.key)[-4:] not in ("_cos", "_sin")
+        if not NOISE & set(words(key.key)) and not _OTHER_NUMBERS.search(_snake(key.key))
     ]
 
 

@@ -540,6 +540,6 @@ def json_of(holder: Any, name: str) -> dict[str, Any]:
     """Return the mapping that an attribute holds as JSON; empty where it holds none."""
     try:
         value = json.loads(text(holder.attrs.get(name)))
-    except (json.JSONDecodeError, RecursionError):
+    except (ValueError, RecursionError):  # of numbers with too many digits too
         return {}
     return value if isinstance(value, dict) else {}

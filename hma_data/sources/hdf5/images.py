@@ -50,8 +50,9 @@ def pixels_of(found: h5py.Dataset, indices: Sequence[int]) -> str:
     sides = shape[1:3] if shape[3] == 3 else shape[2:] if shape[1] == 3 else (0,)
     if min(sides) < LEAST_SIDE:
         return ""
-    values = rows(found, indices).astype(np.float64)
-    low, high = float(values.min()), float(values.max())
+    shown = (rows(found, [index]) for index in indices)  # one by one: a row may claim gigabytes
+    ends = np.array([(image.min(), image.max()) for image in shown], np.float64)
+    low, high = float(ends.min()), float(ends.max())
     if not 0 <= low < high:  # false for NaN too
         return ""
     whole = found.dtype.kind != "f"

@@ -461,6 +461,16 @@ def test_lerobot_names_in_every_form(tmp_path: Path, stated: Any, names: list[st
     assert values["action"]["components"][0].get("names") == names
 
 
+def test_the_currents_of_motors_are_no_state(tmp_path: Path) -> None:  # as AgiBot World has them
+    path = make_v2(tmp_path / "set")
+    info = json.loads((path / "meta/info.json").read_text())
+    state = info["features"]["observation.state"]
+    info["features"] |= {f"observation.states.joint.{name}": state for name in ("current_value", "position")}
+    del info["features"]["observation.state"]
+    (path / "meta/info.json").write_text(json.dumps(info))
+    assert keys(inferred(path), "state") == ["observation.states.joint.position"]
+
+
 def test_lerobot_depth_and_grey_features_are_left_out(tmp_path: Path) -> None:
     path = make_v2(tmp_path / "set")
     info = json.loads((path / "meta/info.json").read_text())

@@ -88,6 +88,19 @@ def test_other_numbers_become_bytes_by_the_range_named(tmp_path, dtype, pixels, 
     np.testing.assert_array_equal(shown(path, [5, 2, 7], pixels=pixels), pictures()[[5, 2, 7]])
 
 
+def test_to_find_their_range_images_are_read_one_by_one(tmp_path: Path, monkeypatch) -> None:
+    from hma_data.sources.hdf5 import images
+
+    path, read = one(tmp_path, data=np.linspace(0, 1, T * 768).reshape(T, 16, 16, 3)), images.rows
+    asked: list[int] = []
+    monkeypatch.setattr(
+        images, "rows", lambda found, wanted: asked.append(len(wanted)) or read(found, wanted)
+    )
+    with h5py.File(path) as file:
+        assert images.pixels_of(file["data/demo_0/obs/agentview_image"], [0, 4, 8]) == "0-1"
+    assert asked == [1, 1, 1]
+
+
 @pytest.mark.parametrize("axes", ["TCHW", None])
 @pytest.mark.parametrize("channels", [1, 3])
 def test_channels_may_come_first(tmp_path: Path, axes: str | None, channels: int) -> None:
@@ -203,7 +216,7 @@ def test_a_group_that_holds_itself_ends(tmp_path: Path) -> None:
 
 def test_a_json_of_the_simulator_may_be_anything(tmp_path: Path) -> None:
     path = one(tmp_path, data=pictures())
-    for value in ("[", json.dumps([1]), json.dumps({"env_kwargs": 3}), "[" * 5_000):
+    for value in ("[", json.dumps([1]), json.dumps({"env_kwargs": 3}), "[" * 5_000, "1" * 5_000):
         with h5py.File(path, "a") as file:
             file["data"].attrs["env_args"] = value
             file["data"].attrs["problem_info"] = value
