@@ -18,12 +18,12 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/conversion": (4_138, 30_563, 15),
     "hma_data/episodes": (1_707, 14_588, 9),
     "hma_data/hub": (517, 3_857, 3),
-    "hma_data/inspection": (2_121, 20_096, 8),
+    "hma_data/inspection": (2_122, 20_100, 8),
     "hma_data/lab": (3_319, 29_459, 16),
     "hma_data/loading": (1_278, 10_753, 6),
     "hma_data/registry": (1_274, 8_220, 6),
     "hma_data/shards": (2_498, 19_207, 11),
-    "hma_data/sources": (12_607, 103_932, 51),
+    "hma_data/sources": (12_608, 103_961, 51),
     "hma_data/storage": (1_697, 11_096, 11),
     "hma_data/tokenizers": (3_465, 25_271, 18),
     "hma_model": (568, 3_417, 4),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_688, 30_184, 20),
     "hma_model/worlds": (1_478, 11_069, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_507, 515_746
-TEST_LINES = 48_403
+PRODUCT_LINES, PRODUCT_NODES = 65_509, 515_779
+TEST_LINES = 48_426
 DOC_WORDS = 41_997
 
 
