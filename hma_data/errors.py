@@ -4,6 +4,8 @@ The command line prints an error as one line and exits with `exit_code`; program
 """
 
 import re
+from collections.abc import Iterable
+from difflib import get_close_matches
 from pathlib import Path
 
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")  # lone surrogates: bytes not UTF-8
@@ -113,6 +115,12 @@ class MissingDependencyError(HMAError):
 def escaped(text: str) -> str:
     """Return a text of one line: control characters, as in a folder's name, become \\n, \\x1b …"""
     return _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+
+
+def meant(word: str, known: Iterable[str], most: int = 3, cutoff: float = 0.6) -> str:
+    """Return a question that names the known words like the given one; nothing where none is like it."""
+    near = get_close_matches(word, list(known), most, cutoff)
+    return f"did you mean {', '.join(map(repr, near))}?" if near else ""
 
 
 def install_command(extra: str = "") -> str:

@@ -13,19 +13,19 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
-    "hma_data": (736, 4_256, 8),
-    "hma_data/cli": (1_541, 10_988, 8),
-    "hma_data/conversion": (4_138, 30_563, 15),
-    "hma_data/episodes": (1_707, 14_588, 9),
+    "hma_data": (744, 4_321, 8),
+    "hma_data/cli": (1_540, 10_986, 8),
+    "hma_data/conversion": (4_134, 30_555, 15),
+    "hma_data/episodes": (1_710, 14_575, 9),
     "hma_data/hub": (517, 3_857, 3),
-    "hma_data/inspection": (2_122, 20_100, 8),
-    "hma_data/lab": (3_319, 29_459, 16),
+    "hma_data/inspection": (2_121, 20_098, 8),
+    "hma_data/lab": (3_318, 29_457, 16),
     "hma_data/loading": (1_278, 10_753, 6),
-    "hma_data/registry": (1_274, 8_220, 6),
-    "hma_data/shards": (2_498, 19_207, 11),
-    "hma_data/sources": (12_608, 103_961, 51),
-    "hma_data/storage": (1_697, 11_096, 11),
-    "hma_data/tokenizers": (3_465, 25_271, 18),
+    "hma_data/registry": (1_268, 8_196, 6),
+    "hma_data/shards": (2_497, 19_195, 11),
+    "hma_data/sources": (12_584, 103_802, 51),
+    "hma_data/storage": (1_697, 11_105, 11),
+    "hma_data/tokenizers": (3_464, 25_269, 18),
     "hma_model": (568, 3_417, 4),
     "hma_model/benchmark": (822, 7_062, 5),
     "hma_model/checkpoint": (944, 7_244, 5),
@@ -41,11 +41,11 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/policies": (2_825, 20_233, 14),
     "hma_model/released": (807, 6_817, 4),
     "hma_model/synthetic": (1_204, 9_248, 5),
-    "hma_model/training": (3_688, 30_184, 20),
+    "hma_model/training": (3_680, 30_166, 20),
     "hma_model/worlds": (1_478, 11_069, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_509, 515_779
-TEST_LINES = 48_426
+PRODUCT_LINES, PRODUCT_NODES = 65_473, 515_611
+TEST_LINES = 48_430
 DOC_WORDS = 41_997
 
 

@@ -356,7 +356,6 @@ def _facts(summary: "Summary", lasting: "list[Finding]") -> dict[str, Any]:
 
 
 def _print_made(summary: "Summary") -> None:
-    """Print what was made, and of which cameras."""
     from hma_data.cli.shards import totals_line
 
     manifest = summary.manifest

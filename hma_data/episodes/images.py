@@ -210,10 +210,8 @@ def resize(
     cv2 = opencv()
     height, width = frames.shape[1:3]
     if rule == "short_side_crop" and height != width:
-        side = min(height, width)
-        top, left = (height - side) // 2, (width - side) // 2
-        frames = frames[:, top : top + side, left : left + side]
-        height = width = side
+        height = width = min(height, width)
+        frames = _middle(frames, height, width)
     if (height, width) == (size, size):
         if out is None:
             return np.ascontiguousarray(frames)
@@ -227,8 +225,7 @@ def resize(
         inner_h = inner_w = size
     if (inner_h, inner_w) != (size, size):
         out[:] = 0
-    top, left = (size - inner_h) // 2, (size - inner_w) // 2
-    inner = out[:, top : top + inner_h, left : left + inner_w]
+    inner = _middle(out, inner_h, inner_w)
     if resize_filter == "antialias":
         _resize_antialiased(frames, inner)
         return out
@@ -241,6 +238,12 @@ def resize(
             frame = np.ascontiguousarray(frame)
         cv2.resize(frame, (inner_w, inner_h), dst=square, interpolation=interpolation)
     return out
+
+
+def _middle(frames: Images, height: int, width: int) -> Images:
+    """Return the middle (N, height, width, 3) of pictures, a view."""
+    top, left = (frames.shape[1] - height) // 2, (frames.shape[2] - width) // 2
+    return frames[:, top : top + height, left : left + width]
 
 
 def _resize_antialiased(frames: Images, out: Images) -> None:

@@ -59,7 +59,6 @@ class _Dumper(yaml.SafeDumper):
     """A writer of YAML in which lists of words, components and cameras are on one line each."""
 
     def ignore_aliases(self, data: Any) -> bool:
-        """Return True: write no aliases, because the parser accepts none."""
         return True
 
     def increase_indent(self, flow: bool = False, indentless: bool = False) -> None:

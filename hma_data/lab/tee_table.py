@@ -112,7 +112,6 @@ class TeeTable:
 
 
 def _area(polygon: Floats) -> float:
-    """Return the area of a polygon (N, 2)."""
     x, y = polygon.T
     return float(abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2)
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator
 
 from hma_data.arrays import Bools
-from hma_data.errors import RegistryError
+from hma_data.errors import RegistryError, meant
 from hma_data.registry.components import (
     LAYOUTS,
     Action,
@@ -378,17 +378,14 @@ def _problem(path: str, item: Any, values: dict[str, Any]) -> Problem:
 
 
 def _unknown_key(path: str, values: dict[str, Any]) -> Problem:
-    from difflib import get_close_matches
-
     parent, of = re.sub(r"\[\d+\]", "", path).rpartition(".")[0], ""
     known: type[BaseModel] = _KEYS_AT.get(parent, Embodiment)
     if parent == "source.layout":
         known, of = LAYOUTS[values["source"]["format"]], f" of format {values['source']['format']}"
     keys, key = _keys(known), path.rpartition(".")[2]
     places = [f"{place}.{key}" for place, model in _KEYS_AT.items() if key in _keys(model)]
-    near = get_close_matches(_OTHER_WORDS.get(key.lower(), key), keys, n=1) or places
-    hint = f", did you mean {near[0]!r}?" if near else ""
-    return Problem(path, f"unknown key{of}{hint}", allowed=", ".join(keys) or "none")
+    near = meant(_OTHER_WORDS.get(key.lower(), key), keys, 1) or meant(key, places, 1, cutoff=0)
+    return Problem(path, f"unknown key{of}{near and f', {near}'}", allowed=", ".join(keys) or "none")
 
 
 def _keys(model: type[BaseModel]) -> list[str]:
@@ -446,14 +443,11 @@ def find(name_or_path: StrPath, beside: StrPath | None = None) -> Embodiment:
             if embodiment.id == name_or_path:
                 return embodiment
             raise RegistryError(paths[0], f"has id {embodiment.id!r}", "file name and id must be the same")
-    from difflib import get_close_matches
-
     if found := misplaced(as_path(name_or_path), "a YAML file"):
         raise RegistryError(name_or_path, *found)
-    near = get_close_matches(name_or_path, [file_id(path) for path in registry_files(folders)], n=3)
-    hint = f"did you mean {', '.join(near)}? " if near else ""
+    hint = meant(name_or_path, [file_id(path) for path in registry_files(folders)])
     raise RegistryError(
         f"embodiment {name_or_path!r}",
         f"is not in {', '.join(map(str, folders)) or 'any registry folder'}",
-        f"{hint}give a YAML file's path, or set HMA_REGISTRY; hma registry list shows all",
+        f"{hint} give a YAML file's path, or set HMA_REGISTRY; hma registry list shows all",
     )

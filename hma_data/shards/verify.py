@@ -39,6 +39,7 @@ from hma_data.shards.manifest import (
 )
 from hma_data.shards.schema import Footer, read_footer, to_numpy
 from hma_data.storage.files import PART, file_sha256
+from hma_data.storage.kinds import one_line
 from hma_data.storage.paths import StrPath
 from hma_data.storage.remote import parquet_file, parquet_input, place
 
@@ -121,8 +122,7 @@ def check_shard(
 
 
 def _line(fault: Exception, path: Path) -> str:
-    """Return a fault as one line that says what to do."""
-    text = " ".join(str(fault).split())[:500]
+    text = one_line(fault, 500)
     return text if isinstance(fault, HMAError) else f"{path}: cannot be read: {text} — {REMAKE}"
 
 

@@ -110,7 +110,6 @@ class WindowIndex:
         return np.arange(0, self.span, self.row_stride)
 
     def _windows_before(self, rows: Ints) -> Ints:
-        """Return how many windows start before each row."""
         if not len(self._starts):
             return np.zeros(len(rows), np.int64)
         at = np.searchsorted(self._starts, rows, side="right") - 1

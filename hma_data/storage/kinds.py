@@ -57,8 +57,8 @@ def own_layout(files: Iterable[Path]) -> str:
 
 
 def one_line(fault: object, length: int = 160) -> str:
-    """Return the text of an error as one line of at most so many letters."""
-    return " ".join(str(fault).split())[:length]
+    """Return the text of an error, or its type if it has none, as one line of at most so many letters."""
+    return " ".join(str(fault).split())[:length] or type(fault).__name__
 
 
 def unreadable(path: Path, fault: str, remedy: str) -> tuple[str, str]:

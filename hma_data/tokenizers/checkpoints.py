@@ -181,7 +181,6 @@ def read_tensors(path: Path, error: type[HMAError] = TokenizerError) -> Tensors:
 
 
 def _read_safetensors(path: Path, error: type[HMAError] = TokenizerError) -> Tensors:
-    """Return the tensors of a safetensors file."""
     with opened_weights(path, error, "pt") as file:
         return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
 

@@ -12,7 +12,6 @@ from them and cannot be given. All faults are reported at once, before any shard
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_type_hints
 
@@ -27,7 +26,7 @@ from pydantic import (
     create_model,
 )  # fmt: skip
 
-from hma_data.errors import HMAError, RecipeError, UsageError
+from hma_data.errors import HMAError, RecipeError, UsageError, meant
 from hma_data.loading.views import view_count
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.paths import StrPath, as_text, shipped
@@ -307,7 +306,7 @@ def find_recipe(name_or_path: StrPath, where: object = None) -> Path:
         if path.is_file():
             return path
     known = sorted(path.stem for path in (folder / "train").glob("*.yaml"))
-    hint = _meant(Path(name).stem, known).removeprefix(", ")
+    hint = meant(Path(name).stem.lower(), known, 1)
     remedy = f"{hint} Give" if hint else "give"
     remedy = f"{remedy} a YAML file or one of {', '.join(known)}"
     if where is not None:
@@ -418,10 +417,10 @@ def _problem(item: Any, home: str) -> str:
     text = _PATTERN if kind == "string_pattern_mismatch" else plain_fault(item)
     if kind == "literal_error":
         allowed = item["ctx"]["expected"].replace(" or ", ", ").replace("'", "").split(", ")
-        near = _meant(str(item["input"]), allowed)
+        near = meant(str(item["input"]).lower(), allowed, 1)
     value = repr(item["input"])
     value = value if len(value) <= 80 else f"{value[:77]}…"
-    return f"{path}: {text}{near} (is {value})"
+    return f"{path}: {text}{near and f', {near}'} (is {value})"
 
 
 def _unknown(path: str) -> str:
@@ -432,13 +431,6 @@ def _unknown(path: str) -> str:
         return "extends: cannot be an override: write it in the recipe's file"
     if home == "model" and key in _DERIVED:
         return f"{path}: follows from the shards and the recipe, and cannot be given"
-    near = _meant(key, list(known[home]))
-    for name in ("mixture", "model") if not home else ():
-        if key in known[name]:
-            near = f", did you mean {f'{name}.{key}'!r}?"
-    return f"{path}: unknown key{near}"
-
-
-def _meant(word: str, known: list[str]) -> str:
-    near = get_close_matches(word.lower(), known, n=1)
-    return f", did you mean {near[0]!r}?" if near else ""
+    inside = [f"{name}.{key}" for name in ("mixture", "model") if not home and key in known[name]]
+    near = meant(key, inside, 1, cutoff=0) or meant(key.lower(), known[home], 1)
+    return f"{path}: unknown key{near and f', {near}'}"

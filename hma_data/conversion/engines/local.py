@@ -103,7 +103,6 @@ class _WorkerProcess:
         self._heard = time.monotonic()
 
     def start_unit(self, number: int, unit: Any, attempt: Attempt) -> None:
-        """Hand a unit to the process."""
         self.unit, self.step = number, ""
         self._heard = time.monotonic()
         with suppress(OSError):  # it died just now; its end will be noticed
@@ -154,7 +153,6 @@ class _Pool:
         self.processes: list[_WorkerProcess] = []
 
     def fill(self) -> None:
-        """Start the processes that are missing."""
         while len(self.processes) < self._count:
             self.processes.append(_WorkerProcess(self._make_work, self._count))
 
@@ -216,7 +214,6 @@ class _Pool:
             self._ledger.lost(process.unit, cause, process.step, how)
 
     def close(self) -> None:
-        """End every process."""
         for process in self.processes:
             process.end()
 

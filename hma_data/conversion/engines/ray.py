@@ -320,7 +320,6 @@ class _Actors:
         self._ledger.lost(number, cause, step, how)
 
     def close(self) -> None:
-        """End every actor."""
         for slot in self._slots:
             self._ray.kill(slot.actor)
 

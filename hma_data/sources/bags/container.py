@@ -25,7 +25,7 @@ from mcap.exceptions import McapError
 
 from hma_data.errors import EpisodeError
 from hma_data.storage.blocks import BlockFile, expect
-from hma_data.storage.kinds import unreadable
+from hma_data.storage.kinds import one_line, unreadable
 from hma_data.storage.remote import LargeFile, is_remote
 
 CACHED_BYTES = 64 << 20  # of unpacked chunks that a bag keeps
@@ -102,8 +102,7 @@ def reading(path: Path) -> Iterator[None]:
     try:
         yield
     except FAULTS as fault:
-        detail = " ".join(str(fault).split())[:200] or type(fault).__name__
-        raise damaged(path, f"is damaged or cut off: {detail}") from fault
+        raise damaged(path, f"is damaged or cut off: {one_line(fault)}") from fault
 
 
 def damaged(path: Path, fault: str) -> EpisodeError:

@@ -59,7 +59,6 @@ class McapFile(IndexedFile):
             return index.notes
 
     def _view(self, file: BinaryIO, at: int, end: int | None = None) -> View:
-        """See IndexedFile."""
         whole = FileView(file, 0, file.seek(0, 2))
         opcode, start, stop = _record(whole, at)
         if opcode != CHUNK:
@@ -67,7 +66,6 @@ class McapFile(IndexedFile):
         return memoryview(self._chunks.get((self.path, at), lambda: _unpacked(whole[start:stop])))
 
     def _messages(self, index: FileIndex, view: View, at: int = 0) -> Iterator[StoredMessage]:
-        """See IndexedFile."""
         for opcode, place, start, end in _records(view, at, len(view)):
             if opcode == MESSAGE:
                 yield _entry(view, place, start, end)
@@ -75,7 +73,6 @@ class McapFile(IndexedFile):
                 self._learn(index, opcode, bytes(view[start:end]))
 
     def _learn(self, index: FileIndex, opcode: int, data: bytes) -> None:
-        """Add a schema or channel record."""
         if opcode == SCHEMA:
             schema = records.Schema.read(_stream(data))
             self._schemas[schema.id] = schema
@@ -181,7 +178,6 @@ def _indexed_chunk(data: bytes) -> tuple[Piece, int]:
 
 
 def _unpacked(data: bytes) -> bytes:
-    """Return the records of a chunk."""
     chunk = records.Chunk.read(_stream(data))
     unpacked = decompress(chunk.compression, chunk.data, chunk.uncompressed_size)
     if chunk.uncompressed_crc and crc32(unpacked) != chunk.uncompressed_crc:

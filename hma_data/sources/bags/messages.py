@@ -46,7 +46,6 @@ def decode(channel: Channel, data: Data, where: str) -> Any:
 
 
 def _line(fault: BaseException) -> str:
-    """Return a library's error as one short line."""
     return " ".join(str(fault.args[0] if fault.args else fault).split())[:200]
 
 

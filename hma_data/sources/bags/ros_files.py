@@ -141,7 +141,6 @@ def _time(header: Header, name: str) -> int:
 
 
 def _learn(index: FileIndex, header: Header, content: Data) -> None:
-    """Add a connection record."""
     from rosbags.typesys.msg import normalize_msgtype
 
     inner = _header(content)

@@ -14,14 +14,13 @@ import re
 from array import array
 from collections.abc import Iterable
 from dataclasses import dataclass
-from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
 
 from hma_data.arrays import Bools, Floats, Ints
 from hma_data.episodes.episode import Stream
-from hma_data.errors import EpisodeError
+from hma_data.errors import EpisodeError, meant
 from hma_data.registry.components import Component
 from hma_data.sources.bags.bag import Bag, BagPlace
 from hma_data.sources.bags.clocks import DAY_S, SECOND_NS, MessageTimes
@@ -135,11 +134,10 @@ def _steps(key: str, at: int, where: str) -> tuple[Step, ...]:
 def missing_topic(key: str, topics: Iterable[str], where: str) -> EpisodeError:
     """Return the error of a key whose topic the bag does not have."""
     known = sorted(" ".join(topic.split()) for topic in topics)
-    near = get_close_matches(re.split(r"[.\[]", key)[0], known, n=2, cutoff=0.5)
-    hint = f"did you mean {' or '.join(near)}? " if near else ""
+    hint = meant(re.split(r"[.\[]", key)[0], known, 2, cutoff=0.5)
     more = f" and {len(known) - MAX_NAMES} more" if len(known) > MAX_NAMES else ""
     listed = f"its topics: {', '.join(known[:MAX_NAMES])}{more}" if known else "it has no topics"
-    return EpisodeError(where, f"the bag has no topic for {key}", hint + listed)
+    return EpisodeError(where, f"the bag has no topic for {key}", f"{hint} {listed}".lstrip())
 
 
 class Column:

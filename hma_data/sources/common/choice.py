@@ -5,11 +5,10 @@ or `@FILE`: a file with one id or glob a line, in which empty lines and lines th
 """
 
 from collections.abc import Iterator, Sequence
-from difflib import get_close_matches
 from fnmatch import filter as matching
 from pathlib import Path
 
-from hma_data.errors import HMAError, RegistryError, UsageError
+from hma_data.errors import HMAError, RegistryError, UsageError, meant
 from hma_data.registry.embodiment import Embodiment
 
 MAX_NAMES = 3  # ids named in an error
@@ -49,8 +48,8 @@ def _named(known: dict[str, None], words: Sequence[str], where: str, error: type
     for word, said in _lines(words, where, error):
         ids = [word] if word in known else matching(known, word)
         if not ids:
-            near = get_close_matches(word, known, n=1) or list(known)[:MAX_NAMES]
-            raise error(where, f"{said} matches no episode", f"there are ids such as {', '.join(near)}")
+            some = f"there are ids such as {', '.join(list(known)[:MAX_NAMES])}"
+            raise error(where, f"{said} matches no episode", meant(word, known, 1) or some)
         found.update(ids)
     return found
 

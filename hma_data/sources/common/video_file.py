@@ -365,7 +365,6 @@ def _video_stream(container: Any, path: str) -> Any:
 
 @contextmanager
 def _explained(path: str) -> Iterator[None]:
-    """Raise FFmpeg's errors as ours."""
     from av.error import FFmpegError
 
     try:

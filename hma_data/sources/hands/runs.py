@@ -11,14 +11,13 @@ N labelled frames of a video, n of a run, w values of a point (2, or 42 for land
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
 from hma_data.arrays import Array, Bools, Floats, Ints
-from hma_data.errors import EpisodeError, SourceError
+from hma_data.errors import EpisodeError, SourceError, meant
 from hma_data.registry.components import HandsLayout
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.common.places import named_files
@@ -101,8 +100,7 @@ def point_of(key: str, where: str) -> str:
         SourceError: it is not a key of hand videos.
     """
     if key not in KEYS:
-        near = get_close_matches(key, KEYS, n=3, cutoff=0.0)
-        raise SourceError(where, f"{key!r} is not a key of hand videos", f"did you mean {', '.join(near)}?")
+        raise SourceError(where, f"{key!r} is not a key of hand videos", meant(key, KEYS, cutoff=0))
     return key.removesuffix("/next").removesuffix("/delta")
 
 

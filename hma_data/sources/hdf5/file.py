@@ -14,7 +14,6 @@ from collections import Counter, OrderedDict
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
@@ -24,10 +23,10 @@ import h5py
 import numpy as np
 
 from hma_data.arrays import Array, Indices
-from hma_data.errors import EpisodeError, HMAError, SourceError
+from hma_data.errors import EpisodeError, HMAError, SourceError, meant
 from hma_data.sources.common.places import local_path, named_files, natural
 from hma_data.sources.common.survey import sampled
-from hma_data.storage.kinds import unreadable
+from hma_data.storage.kinds import one_line, unreadable
 
 SUFFIXES = (".h5", ".hdf5", ".hdf")
 WHOLE_FILE = "/"
@@ -138,7 +137,7 @@ def explained(where: object, error: type[HMAError] = EpisodeError) -> Iterator[N
     try:
         yield
     except (OSError, KeyError, RuntimeError, ValueError, TypeError, ArithmeticError, MemoryError) as fault:
-        said = (str(fault).splitlines() or [type(fault).__name__])[0]
+        said = one_line(fault)
         remedy = "it may be cut off or damaged: copy it again"
         if "plugin" in said or ("filter" in said and "not registered" in said):
             remedy = (
@@ -401,10 +400,8 @@ def member(group: h5py.Group, key: str, where: str) -> Any:
         return group[key.strip("/") or "/"]
     except KeyError as fault:
         keys = [name for name, _ in walk(group)]
-        near = get_close_matches(key.strip("/"), keys, n=3, cutoff=0.5)
-        remedy = (
-            f"did you mean {', '.join(near)}?" if near else f"it has {', '.join(keys[:8]) or 'no datasets'}"
-        )
+        listed = f"it has {', '.join(keys[:8]) or 'no datasets'}"
+        remedy = meant(key.strip("/"), keys, cutoff=0.5) or listed
         raise EpisodeError(where, f"has no {key!r}", remedy) from fault
 
 

@@ -18,7 +18,7 @@ from typing import Any
 from pydantic import BaseModel, Field, NonNegativeInt, PositiveFloat, PositiveInt, ValidationError
 
 from hma_data.errors import EpisodeError, HMAError, SourceError
-from hma_data.storage.kinds import unreadable
+from hma_data.storage.kinds import one_line, unreadable
 from hma_data.storage.yaml_io import first_fault
 
 VERSIONS = ("v2.0", "v2.1", "v3.0")
@@ -313,9 +313,8 @@ def parquet_explained(where: object, error: type[HMAError]) -> Iterator[None]:
     except FileNotFoundError as fault:
         raise error(where, "no such file", "copy the dataset again, whole") from fault
     except (pa.ArrowException, OSError, ValueError, LookupError, TypeError) as fault:
-        said = (str(fault).splitlines() or [type(fault).__name__])[0]
         remedy = "it may be cut off or damaged: copy it again"
-        reason = unreadable(Path(str(where)), f"cannot be read as parquet: {said}", remedy)
+        reason = unreadable(Path(str(where)), f"cannot be read as parquet: {one_line(fault)}", remedy)
         raise error(where, *reason) from fault
 
 

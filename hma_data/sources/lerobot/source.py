@@ -17,7 +17,6 @@ T frames of an episode.
 
 import hashlib
 from collections.abc import Callable
-from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from hma_data.episodes.episode import Episode, Signal, Stream
-from hma_data.errors import EpisodeError, HMAError, SourceError
+from hma_data.errors import EpisodeError, HMAError, SourceError, meant
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, read_vector
 from hma_data.sources.common import checks
@@ -164,8 +163,7 @@ def _check_keys(meta: Metadata, embodiment: Embodiment) -> None:
     where = f"{meta.folder.uri}: embodiment {embodiment.id}"
     for key in [part.key for part in embodiment.components] + [camera.key for camera in embodiment.cameras]:
         if key not in meta.features:
-            near = get_close_matches(key, meta.features, n=3, cutoff=0.4) or list(meta.features)
-            raise SourceError(where, f"{key!r} is not a feature", f"did you mean {', '.join(near)}?")
+            raise SourceError(where, f"{key!r} is not a feature", meant(key, meta.features, cutoff=0))
     for camera in embodiment.cameras:
         feature = meta.features[camera.key]
         if not feature.is_camera:

@@ -112,13 +112,11 @@ class _PictureFailures(logging.Handler):
         self._found: list[BaseException] = []
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Keep the error of a record."""
         words = record.args if isinstance(record.args, tuple) else ()
         faults = [item for item in words if isinstance(item, BaseException)]
         self._found += faults or [OSError(record.getMessage())]
 
     def check(self) -> None:
-        """Raise the first error."""
         if self._found:
             raise self._found[0]
 

@@ -102,7 +102,6 @@ class RecordFile:
             yield lambda start, end: os.pread(file.fileno(), end - start, start)
 
     def _bytes(self, start: int, end: int) -> bytes:
-        """Return a part of a remote file."""
         if not isinstance(self._path, RemotePath) or not self.blocks or start >= end:
             return b""
         with explained(self._path):

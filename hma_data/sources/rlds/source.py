@@ -12,7 +12,6 @@ import math
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from difflib import get_close_matches
 from functools import partial
 from typing import Any
 
@@ -21,7 +20,7 @@ import numpy as np
 from hma_data.arrays import Floats
 from hma_data.episodes.episode import Episode, Pictures, Signal, rate_times
 from hma_data.episodes.images import image_codec
-from hma_data.errors import EpisodeError, SourceError
+from hma_data.errors import EpisodeError, SourceError, meant
 from hma_data.registry.components import Component, Vector
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import SAMPLE, EpisodeRef, Inspection, KeyInfo, read_vector
@@ -227,8 +226,8 @@ def _step_feature(folder: RldsFolder, key: str) -> RldsFeature:
     found = folder.step_features
     if key in found:
         return found[key]
-    near = get_close_matches(key, found, n=3) or [name for name in found if name.endswith("/" + key)]
-    remedy = f"did you mean {', '.join(near)}?" if near else f"its keys: {', '.join(found) or 'none'}"
+    ends = [name for name in found if name.endswith("/" + key)]
+    remedy = meant(key, found) or meant(key, ends, cutoff=0) or f"its keys: {', '.join(found) or 'none'}"
     raise SourceError(folder.uri, f"has no key {key!r} in its steps", remedy)
 
 
@@ -288,7 +287,6 @@ def _ends_with_padding(steps: Steps, keys: Iterable[str]) -> bool:
 
 
 def _instruction(folder: RldsFolder, steps: Steps, key: str | None) -> str:
-    """Return the instruction of the first step."""
     if key is None:
         places = [f"{place}{name}" for place in ("", "observation/") for name in INSTRUCTIONS]
         outside = [f"episode_metadata/{name}" for name in INSTRUCTIONS]

@@ -211,7 +211,7 @@ def test_a_file_names_ids_and_globs(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("only", "exclude", "words"),
     [
-        (["dya_1"], [], "--only: 'dya_1' matches no episode — there are ids such as day_1"),
+        (["dya_1"], [], "--only: 'dya_1' matches no episode — did you mean 'day_1'?"),
         ([], ["evening*"], "--exclude: 'evening*' matches no episode — there are ids such as day_1, day_2"),
         (["day_1"], ["day_*"], "--exclude: leaves none of 5 episodes"),
     ],

@@ -432,7 +432,7 @@ def test_an_id_is_found_on_the_path_and_a_file_by_its_path(registry: Path) -> No
 
 
 def test_an_unknown_id_names_the_nearest(registry: Path) -> None:
-    with pytest.raises(RegistryError, match=r"'my_arn'.*did you mean my_arm"):
+    with pytest.raises(RegistryError, match=r"'my_arn'.*did you mean 'my_arm'"):
         find("my_arn")
 
 

@@ -45,7 +45,7 @@ HOSTILE: dict[str, Row] = {  # none of the recording can be used: it is one bag,
     "ros2-sqlite3-file-zstd: fewer": (
         of("run/metadata.yaml", COUNTS), rf"its index counts 12 messages of {CAMERA}, it holds 10"
     ),
-    "mcap-json: no such topic": (untouched, f"did you mean {CAMERA}", {f"{CAMERA}}}": f"{CAMERA}x}}"}),
+    "mcap-json: no such topic": (untouched, f"did you mean '{CAMERA}", {f"{CAMERA}}}": f"{CAMERA}x}}"}),
     "mcap-json: no images": (untouched, "not images", {f"front, key: {CAMERA}": f"front, key: {COMMAND}"}),
     "parts, mcap-plain: a checksum": (of("run.mcap", wrong_checksum), "checksum"),
     "parts, mcap-zstd: a checksum": (of("run.mcap", wrong_checksum), "checksum"),

@@ -203,7 +203,7 @@ def test_a_second_publisher_of_joints_keeps_its_own_times(numbers_bag: Path) -> 
 @pytest.mark.parametrize(
     ("key", "dims", "more", "says"),
     [
-        ("/cmdd.linear", 3, "", "did you mean /cmd"),
+        ("/cmdd.linear", 3, "", "did you mean '/cmd'"),
         ("/nothing.like.it", 3, "", "/cam, /cmd, /cmd.linear, /joints, /text"),
         ("/cmd.lineer", 3, "", "no field 'lineer'.*linear, angular"),
         ("/cmd.angular.x.y", 1, "", "no field 'y'"),

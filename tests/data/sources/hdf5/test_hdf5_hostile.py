@@ -154,7 +154,11 @@ ONE |= {
     for value in (200.0, -0.5, np.nan, np.inf)
 }
 ALL: dict[str, Row] = {  # no demo can be used
-    "no such key": (untouched, f"demo_0: has no 'obs/agentview'.*did you mean {KEY}", sees("obs/agentview")),
+    "no such key": (
+        untouched,
+        f"demo_0: has no 'obs/agentview'.*did you mean '{KEY}'",
+        sees("obs/agentview"),
+    ),
     "a group": (untouched, f"'obs' is a group.*{KEY}", sees("obs")),
     "a link to itself": (linked("dones", h5py.SoftLink("/data/demo_0/dones")), "'dones'", sees("dones")),
     "another width": (untouched, "actions has 3 values, the embodiment says 7", acts(ACTIONS | {"dims": 7})),

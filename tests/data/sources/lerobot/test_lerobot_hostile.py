@@ -101,7 +101,7 @@ ALL: dict[str, Row] = {  # no episode can be used
     "no episodes": (of(LISTED, cut(0)), "has no episodes"),
     "a task that is a number": (of(TASKS, whole("3")), r"tasks\.jsonl: holds 3, not an object"),
     "another rate": (untouched, "runs at 10 fps.*frequency_hz 30", {"frequency_hz": 30}),
-    "no such camera": (untouched, f"is not a feature.*did you mean {CAMERA}", sees(CAMERA + "era")),
+    "no such camera": (untouched, f"is not a feature.*did you mean '{CAMERA}", sees(CAMERA + "era")),
     "no camera": (untouched, f"'action' is float32, not colour images.*{CAMERA}, {STILL}", sees("action")),
     "another width": (untouched, "action has 2 values, the embodiment says 6", SIX),
 }

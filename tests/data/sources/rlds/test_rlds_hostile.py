@@ -90,7 +90,7 @@ ALL: dict[str, Row] = {  # no episode can be used
     "a packed shard": (of(SHARD, whole(b"\x1f\x8b" + bytes(40))), "gzip-compressed"),
     "zeros": (of(SHARD, whole(bytes(400))), "holds no readable episode"),
     "nothing": (shutil.rmtree, "does not exist"),
-    "no such key": (untouched, "no key 'action/mov'.*did you mean action/move", acts("action/mov", 2)),
+    "no such key": (untouched, "no key 'action/mov'.*did you mean 'action/move'", acts("action/mov", 2)),
     "another width": (untouched, "state has 3 values per step, the embodiment says 7", WIDE),
     "text": (untouched, "text is text of string, not numbers", acts("text", 1)),
     "numbers": (untouched, "action/move is a tensor of float32, not a colour image", sees("action/move")),
