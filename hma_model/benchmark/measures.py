@@ -81,25 +81,31 @@ def choose(
     return {name: np.stack(parts, axis=1) for name, parts in found.items()}
 
 
-def decisions(true: NDArray[Any], made: NDArray[Any], seed: int) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return whether the model's choice truly reaches the goal (N,), and the share of sequences that do.
+def decisions(true: NDArray[Any], made: NDArray[Any], seed: int) -> Arrays:
+    """Return the goals of a choice among sequences, and how far each sequence ends from them.
 
     Args:
         true, made: (N, C, P, 2) last places of the sequences, in the simulator and as read off the model.
         seed: of the goals.
+
+    Returns:
+        `goal` (N,), the sequence whose true end is the goal; `true_px` and `made_px` (N, C), rounded as they
+        are written to the results; `right` (N,), whether the one of least `made_px` truly reaches the goal.
     """
     rows = np.arange(len(true))
-    goals = true[rows, np.random.default_rng([seed, 53]).integers(true.shape[1], size=len(true))][:, None]
-    chosen = np.linalg.norm(made - goals, axis=-1).mean(axis=-1).argmin(axis=1)
-    reach = np.linalg.norm(true - goals, axis=-1).mean(axis=-1) <= REACHED_PX
-    return reach[rows, chosen].astype(float), reach.mean(axis=1)
+    goal = np.random.default_rng([seed, 53]).integers(true.shape[1], size=len(true))
+    wanted = true[rows, goal][:, None]
+    far, seen = (np.linalg.norm(ends - wanted, axis=-1).mean(axis=-1).round(3) for ends in (true, made))
+    right = far[rows, seen.argmin(axis=1)] <= REACHED_PX
+    return {"goal": goal, "true_px": far, "made_px": seen, "right": right}
 
 
-def choice_figures(arrays: Arrays, seed: int) -> tuple[dict[str, Any], dict[str, list[float]]]:
-    """Return the figures of `choose`, and those of each scene."""
+def choice_figures(arrays: Arrays, seed: int) -> tuple[dict[str, Any], dict[str, Any], Arrays]:
+    """Return the figures of `choose`, those of each scene, and what the decisions go by."""
     signal, copied = arrays["psnr"].mean(axis=1), arrays["copy_psnr"].mean(axis=1)  # (N, T)
     errors = np.linalg.norm(arrays["made"] - arrays["true"], axis=-1).mean(axis=(1, 3))
-    right, chance = decisions(arrays["true"][:, :, -1], arrays["made"][:, :, -1], seed)
+    choices = decisions(arrays["true"][:, :, -1], arrays["made"][:, :, -1], seed)
+    right = choices.pop("right").astype(float)
     found = horizon_summary("psnr", signal, seed, within=PSNR_RANGE)
     found |= summary("copy_psnr", copied.mean(axis=1), seed, within=PSNR_RANGE)
     found |= summary("copy_psnr_last", copied[:, -1], seed, within=PSNR_RANGE)
@@ -108,7 +114,7 @@ def choice_figures(arrays: Arrays, seed: int) -> tuple[dict[str, Any], dict[str,
     found |= {
         "decision": rounded(right.mean()),
         "decision_95": rounded(ends),
-        "chance": rounded(chance.mean()),
+        "chance": rounded((choices["true_px"] <= REACHED_PX).mean()),
     }
     by_scene = {
         "psnr": signal.mean(axis=1),
@@ -117,7 +123,7 @@ def choice_figures(arrays: Arrays, seed: int) -> tuple[dict[str, Any], dict[str,
         "error_px_last": errors[:, -1],
         "decision": right,
     }
-    return found, {name: rounded(values) for name, values in by_scene.items()}
+    return found, {name: rounded(values) for name, values in by_scene.items()}, choices
 
 
 def frame_errors(arrays: Arrays) -> Arrays:

@@ -125,16 +125,17 @@ def benchmark(
                 raise OutputError(folder, "holds the results of other settings", "give another folder")
         else:
             kept = KeptParts(folder / WORK, facts)
-            made, by_scene, by_frame = {}, {}, {}
+            tables = "measures", "by_scene", "by_frame", "by_choice"
+            made: dict[str, dict[str, Any]] = {name: {} for name in tables}
             for number, robot in enumerate(robots):
 
                 def tell(words: str, number: int = number, robot: str = robot) -> None:
                     on_progress(number, f"{robot}, {words}")
 
                 one = _Robot(world, robot, protocol, seed, kept, tell)
-                made[robot], by_scene[robot], by_frame[robot] = one.measured()
-            found = facts | {"checkpoint": str(checkpoint), "measures": made}
-            found |= {"by_scene": by_scene, "by_frame": by_frame}
+                for name, figures in zip(tables, one.measured(), strict=True):
+                    made[name][robot] = figures
+            found = facts | {"checkpoint": str(checkpoint)} | made
             write_atomic(folder / RESULTS, json.dumps(found | {"sha256": digest(found)}, indent=1))
         remove_kept(folder / WORK)  # of a job killed here, too
         for robot, measured in found["measures"].items():
@@ -162,14 +163,14 @@ class _Robot:
     def probe(self) -> Probe:
         return train_probe(self.robot, self.world.tokenizer, self.scenes.stride, self.seed, self.tell)
 
-    def measured(self) -> tuple[dict[str, Any], dict[str, list[float]], dict[str, Any]]:
-        """Return the figures, those of each scene, and those of each frame of the action sequences."""
+    def measured(self) -> tuple[dict[str, Any], ...]:
+        """Return the figures, and those by scene, by frame of the action sequences and by choice."""
         frames = self.protocol.frames
         self.tell("action sequences")
         arrays = self._part(
             "choices", lambda: choose(self.world, self.scenes, self.probe, Scripted(NOISE), frames)
         )
-        found, by_scene = choice_figures(arrays, self.seed)
+        found, by_scene, by_choice = choice_figures(arrays, self.seed)
         by_frame = frame_errors(arrays)
         way = self.world.decoding
         found["calibration"] = calibration(
@@ -197,7 +198,8 @@ class _Robot:
         self.tell("speed")
         timed = self._part("speed", lambda: speed(self.world, self.scenes))
         found |= {name: rounded(value, 2) for name, value in timed.items()}
-        return found, by_scene, {name: rounded(values) for name, values in by_frame.items()}
+        raw = ({name: rounded(values) for name, values in one.items()} for one in (by_frame, by_choice))
+        return found, by_scene, *raw
 
     def _part(self, name: str, make: Callable[[], Arrays]) -> Arrays:
         return self.kept.part(f"{name}-{self.robot}", make)

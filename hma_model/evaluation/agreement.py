@@ -9,6 +9,7 @@ M policies, N episodes, R resamples. All intervals hold 95 %.
 """
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -110,19 +111,41 @@ def correlations(one: Floats, other: Floats, seed: int = 0) -> dict[str, Estimat
         return dict.fromkeys(("pearson", "spearman"), Estimate(None, reason=reason))
     measures = {"pearson": pearson, "spearman": spearman}
     means = one.mean(axis=1), other.mean(axis=1)
-    policies, episodes = one.shape
+    policies = len(one)
     if policies < FEW_POLICIES:
         return {name: Estimate(float(measure(*means))) for name, measure in measures.items()}
-    rng = np.random.default_rng(seed)
-    rows = rng.integers(policies, size=(RESAMPLES, policies))
+    rows = np.random.default_rng(seed).integers(policies, size=(RESAMPLES, policies))
     # two policies always correlate by 1 or -1, so draws of so few say nothing
-    rows = rows[[len(set(drawn)) >= MIN_POLICIES for drawn in rows.tolist()]]
-    columns = rng.integers(episodes, size=(len(rows), episodes))
-    drawn = [values[rows[:, :, None], columns[:, None]].mean(axis=-1) for values in (one, other)]
+    told = [len(set(drawn)) >= MIN_POLICIES for drawn in rows.tolist()]
+    drawn = [np.take_along_axis(one, rows, axis=1)[told] for one in _resampled((one, other), seed)]
     found = {}
     for name, measure in measures.items():
-        found[name] = Estimate(float(measure(*means)), *_ends(measure(*drawn), -1.0, 1.0))
+        found[name] = _mirrored(measure(*means), measure(*drawn), -1.0, 1.0)
     return found
+
+
+def _resampled(judged: Sequence[Floats], seed: int) -> list[Floats]:
+    """Return the means (R, M) of judgements (M, N) over episodes that are drawn for all of them together.
+
+    One episode is added, in which each policy's figure is any one of the judgement. Without it, few episodes
+    that all agree would make the agreement certain.
+    """
+    rng = np.random.default_rng(seed)
+    count = judged[0].shape[1]
+    drawn = _drawn_episodes(count, seed)
+    added = [rng.choice(values.ravel(), (RESAMPLES, len(values))) for values in judged]
+    return [(drawn @ values.T + more) / (count + 1) for values, more in zip(judged, added, strict=True)]
+
+
+def _mirrored(value: Floats, spread: Floats, least: float, most: float) -> Estimate:
+    """Return a figure with the interval of resampled ones (R,), widened by its mirror image.
+
+    Noise of the means weakens correlations and adds rank violations: in the figure, and once more in the
+    resamples. What they are too far to one side, the figure is too.
+    """
+    low, high = _ends(spread, least, most)
+    ends = min(low, 2 * value - high), max(high, 2 * value - low)
+    return Estimate(float(value), *(float(end) for end in np.clip(ends, least, most)))
 
 
 def _ends(spread: Floats, least: float, most: float) -> tuple[float, float]:
@@ -151,16 +174,13 @@ def rank_violation(true: ArrayLike, made: ArrayLike) -> Floats:
 def mmrv(true: Floats, made: Floats, seed: int = 0) -> Estimate:
     """Return the MMRV of the means of two judgements (M, N) of the same episodes.
 
-    A resample draws episodes, jointly for all policies and both judgements; the policies stay. Noise can only
-    add violations, so the interval is widened to hold the value.
+    A resample draws episodes, jointly for all policies and both judgements; the policies stay.
     """
     if reason := _too_little(true):
         return Estimate(None, reason=reason)
-    value = float(rank_violation(true.mean(axis=1), made.mean(axis=1)))
-    drawn = _drawn_episodes(true.shape[1], seed)  # sums of outcomes are exact, so equal policies stay equal
-    spread = rank_violation(drawn @ true.T, drawn @ made.T) / true.shape[1]
-    low, high = _ends(spread, 0.0, 1.0)
-    return Estimate(value, min(low, value), max(high, value))
+    value = rank_violation(true.mean(axis=1), made.mean(axis=1))
+    spread = rank_violation(*_resampled((true, made), seed))
+    return _mirrored(value, spread, 0.0, float(np.ptp(true)))
 
 
 def _drawn_episodes(count: int, seed: int) -> Floats:

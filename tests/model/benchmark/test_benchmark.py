@@ -77,6 +77,11 @@ def test_a_flawless_model_has_every_figure_at_its_best_and_a_frozen_one_guesses(
     one, other = best[ROBOT], frozen[ROBOT]
     assert one["psnr"] == PSNR_LIMIT and one["error_px_last"] == 0 and one["decision"] == 1
     assert one["decision_95"][0] < 0.5  # three scenes make nothing certain
+    for folder in folders:  # the decisions are recomputed from what is written
+        written = read_results(folder)
+        choices, right = written["by_choice"][ROBOT], written["by_scene"][ROBOT]["decision"]
+        for goal, true, made, said in zip(*choices.values(), right, strict=True):
+            assert true[int(goal)] == 0 and said == (true[made.index(min(made))] <= REACHED_PX)
     assert one["inverse"]["return_px"] == one["inverse"]["true_return_px"] < 2 < one["inverse"]["turn_px"]
     assert one["policies"]["paired"]["first_chunks_equal"] and one["frames_per_second"] > 0
     assert other["psnr"] == other["copy_psnr"] < one["psnr"] and other["error_px"] > 1
@@ -137,7 +142,7 @@ CHOICES = st.tuples(st.integers(1, 4), st.integers(2, 5)).flatmap(
 def test_a_decision_is_what_plain_loops_compute(drawn: tuple[np.ndarray, np.ndarray, int]) -> None:
     true, made, seed = drawn
     goals = np.random.default_rng([seed, 53]).integers(true.shape[1], size=len(true))
-    right, chance = decisions(true, made, seed)
+    found = decisions(true, made, seed)
 
     def far(places: np.ndarray, goal: np.ndarray) -> float:
         return sum(float(np.hypot(*(a - b))) for a, b in zip(places, goal, strict=True)) / len(places)
@@ -145,10 +150,12 @@ def test_a_decision_is_what_plain_loops_compute(drawn: tuple[np.ndarray, np.ndar
     for scene, goal in enumerate(goals):
         there = true[scene, goal]
         distances = [far(one, there) for one in made[scene]]
-        reaching = [far(one, there) <= REACHED_PX for one in true[scene]]
-        assert chance[scene] == pytest.approx(sum(reaching) / len(reaching))
-        nearest = [k for k, value in enumerate(distances) if value <= min(distances) + 1e-9]
-        assert right[scene] in {float(reaching[k]) for k in nearest}
+        truly = [far(one, there) for one in true[scene]]
+        assert found["goal"][scene] == goal
+        assert found["made_px"][scene].tolist() == pytest.approx(distances, abs=6e-4)
+        assert found["true_px"][scene].tolist() == pytest.approx(truly, abs=6e-4)
+        nearest = [k for k, value in enumerate(distances) if value <= min(distances) + 1e-3]
+        assert found["right"][scene] in {truly[k] <= REACHED_PX + 1e-3 for k in nearest}
 
 
 def test_actions_without_an_inverse_are_refused_by_name() -> None:
