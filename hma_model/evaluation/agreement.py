@@ -143,9 +143,10 @@ def _mirrored(value: Floats, spread: Floats, least: float, most: float) -> Estim
     Noise of the means weakens correlations and adds rank violations: in the figure, and once more in the
     resamples. What they are too far to one side, the figure is too.
     """
+    middle = float(value)
     low, high = _ends(spread, least, most)
-    ends = min(low, 2 * value - high), max(high, 2 * value - low)
-    return Estimate(float(value), *(float(end) for end in np.clip(ends, least, most)))
+    below, above = min(low, 2 * middle - high), max(high, 2 * middle - low)
+    return Estimate(middle, max(below, least), min(above, most))
 
 
 def _ends(spread: Floats, least: float, most: float) -> tuple[float, float]:

@@ -48,14 +48,18 @@ def download(folder: Path, given: argparse.Namespace) -> None:
 def prepare(source: Path, out: Path) -> tuple[Path, Path]:
     """Repack every Zarr folder below `source`; those that are there are kept.
 
+    Numbers before their names keep DriftWorld's order, in which domain10 comes before domain2.
+
     Raises:
         SourceError: there is none, or one is damaged.
     """
     folders = sorted(path.parent for path in source.rglob("*.zarr/.zgroup"))
     if not folders:
         raise SourceError(source, "holds no folder NAME.zarr", f"give the {PART} of {REPOSITORY}")
-    for folder in folders:
-        final = out / f"{folder.stem}.hdf5"
+    wanted = {out / f"{number:03d}_{folder.stem}.hdf5": folder for number, folder in enumerate(folders)}
+    for stale in set(out.glob("*.hdf5")) - set(wanted):  # of a download that was not whole
+        stale.unlink()
+    for final, folder in wanted.items():
         if not final.is_file():
             with atomic_path(final) as part:
                 repack(folder, part)

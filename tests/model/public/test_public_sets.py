@@ -28,6 +28,7 @@ from hma_model.config import HMAConfig
 from hma_model.network.model import HMA
 from hma_model.worlds.world import World
 from recipes.public import dino_wm, gpc, iws, sets
+from recipes.public.rollouts import Recording
 from recipes.public.sets import BASELINE, checked_file, gaussian_ssim
 from recipes.public.worldarena import export
 from recipes.public.zarr2 import ZarrArray, unblosc
@@ -68,13 +69,25 @@ def test_episodes_beyond_those_that_driftworld_trains_on_are_held_out(tmp_path, 
     monkeypatch.setattr(gpc, "TRAINED", 4)
     source = look_alikes.gpc(tmp_path / "published")
     recording, _ = gpc.prepare(source, tmp_path / "out")
-    with h5py.File(recording / "domain18.hdf5") as file:
+    with h5py.File(recording / "000_domain18.hdf5") as file:
         assert [name.decode() for name in file["mask/valid"]] == ["demo_4", "demo_5"]
         assert file["data/demo_2/img"].shape == (22, 96, 96, 3) and file["data/demo_2/img"].dtype == np.uint8
         images, actions, states = look_alikes.push(2, 22, 96)
         assert np.array_equal(file["data/demo_2/img"], images)
         assert np.array_equal(file["data/demo_2/action"], actions)
         assert np.array_equal(file["data/demo_2/state"], states)
+
+
+def test_folders_of_gpc_come_in_driftworlds_order_and_none_hides_another(tmp_path) -> None:
+    published = tmp_path / "published"
+    for count, name in enumerate(("a/domain2", "a/domain10", "b/domain2"), 1):
+        (zarr,) = look_alikes.gpc(tmp_path / str(count), episodes=count, frames=4).rglob("*.zarr")
+        (published / name).parent.mkdir(parents=True, exist_ok=True)
+        zarr.rename(published / f"{name}.zarr")
+        recording, _ = gpc.prepare(published, tmp_path / "out")  # as the download grows
+    found = [name.partition("_")[2] for name in Recording(recording, find("gpc_pusht")).ids]
+    order = {"domain10": (0, 1), "domain2": (0, 0, 1, 2)}
+    assert found == [f"{name}/demo_{demo}" for name, demos in order.items() for demo in demos]
 
 
 def test_windows_of_gpc_are_the_first_in_order() -> None:
