@@ -27,11 +27,11 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/storage": (1_697, 11_105, 11),
     "hma_data/tokenizers": (3_464, 25_269, 18),
     "hma_model": (568, 3_417, 4),
-    "hma_model/benchmark": (822, 7_062, 5),
+    "hma_model/benchmark": (830, 7_078, 5),
     "hma_model/checkpoint": (944, 7_244, 5),
     "hma_model/cli": (1_769, 11_472, 12),
     "hma_model/demo": (476, 4_001, 4),
-    "hma_model/evaluation": (4_487, 35_632, 24),
+    "hma_model/evaluation": (4_508, 35_758, 24),
     "hma_model/export": (1_167, 9_243, 9),
     "hma_model/generation": (1_635, 13_142, 9),
     "hma_model/hub": (1_063, 8_140, 6),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_680, 30_166, 20),
     "hma_model/worlds": (1_478, 11_069, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_473, 515_611
-TEST_LINES = 48_430
+PRODUCT_LINES, PRODUCT_NODES = 65_502, 515_753
+TEST_LINES = 48_465
 DOC_WORDS = 41_997
 
 
