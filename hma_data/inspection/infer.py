@@ -206,25 +206,30 @@ class _Draft:
         self.seen, self.looks = _showing(cameras(found.keys), found.findings)
         if not self.seen.keys:
             raise _lacks(found, "has no colour camera", [key for key in found.keys if key.kind == "camera"])
-        numbers, pools = vectors(found.keys), list[list[KeyInfo]]()
+        numbers = vectors(found.keys)
+        pools = [numbers]
         if not self.timed:  # HDF5 has other arrays too: take those with one row per frame
             lengths = [key.count for key in self.seen.keys]
             length = max(set(lengths), key=lengths.count)
-            self.seen = replace(self.seen, keys=tuple(key for key in self.seen.keys if key.count == length))
-            before = [key for key in numbers if key.count is not None and key.count + 1 == length]
-            numbers = [key for key in numbers if key.count == length]
-            pools.append(before)  # HDF5 may have an observation after the last action
+            near = [length, (length or 0) - 1]  # there may be an observation after the last action
+            alike = near[:1]
+            if is_video(self.seen.keys[0].key):  # or a video may lack its last frame
+                alike = near = [*near, (length or 0) + 1]
+            self.seen = replace(self.seen, keys=tuple(key for key in self.seen.keys if key.count in alike))
+            pools = [[key for key in numbers if key.count == count] for count in near]
         if self.bag:
             running = tuple(key for key in self.seen.keys if infer_topics.runs(key))
             self.seen = replace(self.seen, keys=running or self.seen.keys)
         rh20t = found.format == "rh20t"  # the names of its tables, not of their values, tell what they hold
         tables = [key for key in found.keys if key.kind == "vector"]
         guesses = ACTION_GUESSES.get(found.format, STEP_GUESSES)
-        pools.insert(0, tables if rh20t else numbers)
-        choices = (guess(pool) for guess in guesses for pool in pools)
+        choices = (guess(pool) for guess in guesses for pool in ([tables] if rh20t else pools))
         self.action = next((choice for choice in choices if choice.keys), Choice())
+        self.uneven = self._uneven()
+        if "frames_missing" in self.uneven:
+            pools = [pool for pool in pools if self.action.keys[0] in pool]
         chosen_states = infer_topics.states if self.bag else states
-        self.states = chosen_states(numbers, () if rh20t else self.action.keys)
+        self.states = chosen_states(pools[0], () if rh20t else self.action.keys)
         if not self.action.keys:
             raise _lacks(found, "has nothing that could be an action", self.seen.keys)
         self.by_receipt = infer_topics.why_by_receipt([*self.seen.keys, *self.action.keys, *self.states])
@@ -268,7 +273,7 @@ class _Draft:
         said = self._instruction()
         source |= {"instruction": said} if said else {}
         layout = {key: facts[key] for key in ("timestamps", "pixels", "pairing") if facts.get(key)}
-        layout |= {"last_observation": "drop"} if self._drops_last() else {}
+        layout |= self.uneven
         source |= {"layout": layout} if layout else {}
         values |= {"source": source, "provenance": self._provenance()}
         taken = {key.key for key in self.used} | {said, ""}
@@ -293,9 +298,12 @@ class _Draft:
         lengths = self.found.lengths
         return not self._rate() and bool(lengths) and statistics.median(lengths) < 2 * FRAMES_PER_EPISODE
 
-    def _drops_last(self) -> bool:
-        """Check whether the action has a row less than the frames, so that the last frame has none."""
-        return not self.timed and self.action.keys[0].count != self.seen.keys[0].count
+    def _uneven(self) -> dict[str, Any]:
+        """Return the keys of the layout for a frame after the last action, or missing at a video's end."""
+        rows = [key.count for key in self.action.keys if key.count and not self.timed]
+        more = [key.count - rows[0] for key in self.seen.keys if rows and key.count]
+        drop = {"last_observation": "drop"} if max(more, default=0) > 0 else {}
+        return drop | ({"frames_missing": -min(more)} if min(more, default=0) < 0 else {})
 
     def _commands(self) -> list[KeyInfo]:
         """Return the keys of the action as the YAML names them: of RH20T, those of the next sample."""

@@ -23,7 +23,7 @@ from hma_data.sources.detect import detect
 from hma_data.sources.hdf5.videos import video_path
 from tests.conftest import BlockTokenizer
 from tests.data.hdf5_files import embodiment
-from tests.data.inferring import answered, inferred
+from tests.data.inferring import answered, first_clip, inferred, keys
 from tests.data.videos import encode, number_of
 from tests.hostile import Edit, Row, check_refused, cut, linked_away, of, values, whole
 
@@ -121,6 +121,19 @@ def test_a_yaml_is_inferred_from_numbers_with_a_video_beside_them(tmp_path: Path
     for name in HDF5.episode_ids(str(tmp_path / "lab")):
         first = HDF5.read(str(tmp_path / "lab"), name, arm).streams["front"].frames([0])[0]
         assert number_of(first) == (10 if "10" in name else 1)
+
+
+@pytest.mark.parametrize("counts", [[T - 1], [T, T - 1], [T - 1, T - 1]])
+def test_a_video_that_lacks_its_last_frame_hides_no_action(tmp_path: Path, counts: list[int]) -> None:
+    with h5py.File(tmp_path / "run.h5", "w") as file:
+        file["action"], file["qpos"] = np.ones((T, 3)), np.ones((T, 2))
+    for number, count in enumerate(counts):
+        encode(tmp_path / f"cam{number}.mp4", range(count), fps=60)
+    values = inferred(tmp_path)
+    assert (keys(values, "action"), keys(values, "state")) == (["action"], ["qpos"])
+    assert keys(values, "cameras") == [f"cam{number}.mp4" for number in range(len(counts))]
+    assert values["source"]["layout"] == {"frames_missing": 1}
+    assert len(first_clip(tmp_path, values)) == T - 1
 
 
 def test_a_folder_of_many_episodes_is_listed_once_for_a_pattern(tmp_path: Path, monkeypatch) -> None:
