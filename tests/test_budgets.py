@@ -18,7 +18,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/conversion": (4_134, 30_555, 15),
     "hma_data/episodes": (1_710, 14_575, 9),
     "hma_data/hub": (517, 3_857, 3),
-    "hma_data/inspection": (2_121, 20_098, 8),
+    "hma_data/inspection": (2_129, 20_225, 8),
     "hma_data/lab": (3_318, 29_457, 16),
     "hma_data/loading": (1_278, 10_753, 6),
     "hma_data/registry": (1_268, 8_196, 6),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_680, 30_166, 20),
     "hma_model/worlds": (1_478, 11_069, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_502, 515_753
-TEST_LINES = 48_465
+PRODUCT_LINES, PRODUCT_NODES = 65_510, 515_880
+TEST_LINES = 48_478
 DOC_WORDS = 41_997
 
 
