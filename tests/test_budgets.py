@@ -29,7 +29,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model": (568, 3_417, 4),
     "hma_model/benchmark": (830, 7_078, 5),
     "hma_model/checkpoint": (944, 7_244, 5),
-    "hma_model/cli": (1_769, 11_472, 12),
+    "hma_model/cli": (1_767, 11_460, 12),
     "hma_model/demo": (476, 4_001, 4),
     "hma_model/evaluation": (4_508, 35_758, 24),
     "hma_model/export": (1_167, 9_243, 9),
@@ -41,11 +41,11 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/policies": (2_825, 20_233, 14),
     "hma_model/released": (807, 6_817, 4),
     "hma_model/synthetic": (1_204, 9_248, 5),
-    "hma_model/training": (3_680, 30_166, 20),
+    "hma_model/training": (3_689, 30_261, 20),
     "hma_model/worlds": (1_478, 11_069, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_510, 515_880
-TEST_LINES = 48_478
+PRODUCT_LINES, PRODUCT_NODES = 65_517, 515_963
+TEST_LINES = 48_484
 DOC_WORDS = 41_997
 
 

@@ -19,7 +19,6 @@ from typer import Argument, Option
 
 from hma_data.cli.options import choice_option, pairs, robot_option
 from hma_data.console import CONTINUE, say
-from hma_data.cpu import usable_cores
 from hma_data.errors import EpisodeError, Interrupted, RegistryError, UsageError
 from hma_model.cli.options import embedded_robots
 
@@ -58,7 +57,6 @@ def try_recording(
     if name in embedded_robots(""):  # the bundled model has another robot of this id
         name = f"my_{name}"
     shards, run, film = folder / "shards", folder / "run", folder / "film.mp4"
-    cpu_seconds = round(60 * minutes * usable_cores())
     done: list[list[str]] = []
 
     def step(*words: object, there: bool = False) -> None:
@@ -75,7 +73,7 @@ def try_recording(
     chosen = [word for name in only or () for word in ("--only", name)]
     tokenizer = _tokenizer(data, embodiment)
     step("convert", data, "-e", embodiment, "--tokenizer", tokenizer, *chosen, "--out", shards)
-    time_limit = (f"cpu_seconds={cpu_seconds}", f"steps={UNLIMITED_STEPS}")
+    time_limit = (f"seconds={round(60 * minutes)}", f"steps={UNLIMITED_STEPS}")
     again = ("--force",) if run.is_dir() else ()  # with more --minutes, a run goes on
     step("finetune", shards, "--from", BUNDLED, *time_limit, "--out", run, *again)
     split, most = _shown_split(shards)

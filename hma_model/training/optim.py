@@ -59,13 +59,13 @@ def learning_rate(recipe: Recipe) -> float:
 def lr_scale(step: int, recipe: Recipe, done: float = 0.0) -> float:
     """Return the factor of the peak in step `step`, counted from 0.
 
-    With `cpu_seconds`, a cosine falls by `done`, the share of the run that is done.
+    In a run that ends by time, a cosine falls by `done`, the share of the run that is done.
     """
     if step < recipe.warmup:
         return (step + 1) / recipe.warmup
     if recipe.schedule == "constant_with_warmup":
         return 1.0
-    along = done if recipe.cpu_seconds else (step - recipe.warmup) / max(recipe.steps - 1 - recipe.warmup, 1)
+    along = done if recipe.ends_by_time else (step - recipe.warmup) / max(recipe.steps - 1 - recipe.warmup, 1)
     return recipe.lr_end + (1 - recipe.lr_end) * 0.5 * (1 + math.cos(math.pi * min(along, 1.0)))
 
 

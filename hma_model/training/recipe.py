@@ -139,7 +139,8 @@ class Recipe(_Settings):
     places: Count = Field(0, ge=0, description="maximum trunk tokens per camera frame; 0: no limit")
 
     steps: Count = Field(1000, ge=1, le=10**12)
-    # an end by time: of a rank's process in steps, all its threads; lr then falls by the share that is spent
+    # an end by time in steps; lr then falls by the share that is spent. CPU time is that of a rank's threads
+    seconds: Number = Field(0.0, ge=0, description="maximum seconds of training steps; 0: no limit")
     cpu_seconds: Number = Field(0.0, ge=0, description="maximum CPU seconds of training steps; 0: no limit")
     lr: Number = Field(3e-4, gt=0, le=1e6)
     optimizer: Literal["adamw", "muon"] = Field("adamw", description="muon: for the blocks' matrices")
@@ -187,6 +188,11 @@ class Recipe(_Settings):
     def windows_per_step(self) -> int:
         """Return the number of windows of a step, between two updates of the weights."""
         return self.batch_size * self.accumulate
+
+    @property
+    def ends_by_time(self) -> bool:
+        """Return whether the run may end before its steps are done."""
+        return bool(self.seconds or self.cpu_seconds)
 
     def values(self) -> dict[str, Any]:
         """Return all settings as plain values."""

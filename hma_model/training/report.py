@@ -101,7 +101,7 @@ def _headline(
     losses = [loss for loss in own if loss is not None]
     pace = sum(s["windows"] for s in recent) / max(sum(s["step_seconds"] for s in recent), 1e-9)
     last = evaluations[-1] if evaluations else {}
-    planned = "" if recipe.get("cpu_seconds") else f" of {recipe['steps']:,}"
+    planned = "" if recipe.get("cpu_seconds") or recipe.get("seconds") else f" of {recipe['steps']:,}"
     tiles = [
         (f"{recent[-1]['step']:,}{planned}", "steps"),
         (_short(_mean(losses)) if losses else "", f"training loss, {main}, last {len(recent)} steps"),

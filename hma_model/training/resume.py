@@ -54,7 +54,7 @@ class RunState:
     sampler: dict[str, Any]  # `TrainData.state`
     skipped: int = 0  # number of steps skipped because a loss or gradient was not finite
     seconds: float = 0.0  # time spent in steps so far
-    cpu_seconds: float = 0.0  # and CPU time, the mean over the ranks
+    cpu_seconds: float = 0.0  # and CPU time
     evaluation: dict[str, Any] = field(default_factory=dict)  # the figures of the last evaluation
 
     def require_same(self, recipe: dict[str, Any], data: dict[str, str], where: object) -> None:

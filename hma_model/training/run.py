@@ -131,7 +131,7 @@ class Run:
         self.model = self._fresh_model()
         self.held_out = HeldOut(recipe, self.sets, self.objective)
         self.step, self.skipped, self.seconds = 0, 0, 0.0  # finished steps, and the time they took
-        self.cpu_seconds = 0.0  # of the steps, the mean over the ranks
+        self.cpu_seconds = 0.0  # of the steps; both are means over the ranks if the run ends by time
         self.evaluation: dict[str, Any] = {}  # the figures of the last one
         self.likes: dict[str, str] = {}  # new robot -> the robot with whose stem it began
         self.notes: list[str] = []  # texts for the user that nobody has shown yet
@@ -178,9 +178,12 @@ class Run:
 
     @property
     def done(self) -> float:
-        """Return the share of the run that is done: of its steps or its CPU seconds, whichever is larger."""
-        limit = self.recipe.cpu_seconds
-        return max(self.step / self.recipe.steps, self.cpu_seconds / limit if limit else 0.0)
+        """Return the share of the run that is done: of its steps or its time, whichever is larger."""
+        recipe, shares = self.recipe, [self.step / self.recipe.steps]
+        for spent, limit in ((self.seconds, recipe.seconds), (self.cpu_seconds, recipe.cpu_seconds)):
+            if limit:
+                shares.append(spent / limit)
+        return max(shares)
 
     def note_settings(self) -> None:
         """Note what the user may not expect of the recipe and the data."""
@@ -267,11 +270,11 @@ class Run:
             self.optimizer.step()
             if self.average:
                 self.average.update(self.step)
-        spent = time.monotonic() - begun
+        spent, spent_cpu = time.monotonic() - begun, time.process_time() - cpu_begun
+        if recipe.ends_by_time:  # all ranks end after the same step
+            spent, spent_cpu = (self.ranks.sum(torch.tensor([spent, spent_cpu])) / self.ranks.size).tolist()
         self.seconds += spent
-        if recipe.cpu_seconds:  # all ranks end after the same step
-            spent_cpu = torch.tensor([time.process_time() - cpu_begun])
-            self.cpu_seconds += float(self.ranks.sum(spent_cpu)[0]) / self.ranks.size
+        self.cpu_seconds += spent_cpu
         return {
             "step": self.step,
             "done": round(self.done, 6),

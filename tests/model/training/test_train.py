@@ -153,6 +153,12 @@ def test_a_budget_of_cpu_seconds_ends_the_run_and_bends_the_rate(recipe, tmp_pat
     assert rates == pytest.approx([made.lr * 0.5 * (1 + math.cos(math.pi * k / 5)) for k in range(5)])
 
 
+def test_a_budget_of_seconds_ends_the_run_and_its_steps_may_end_it_sooner(recipe, tmp_path):
+    for seconds, steps in ((1e-9, 1), (1e9, 3)):
+        result = train(recipe(steps=3, seconds=seconds), out=tmp_path / str(steps), show=False)
+        assert (result.step, result.interrupted) == (steps, False)
+
+
 def test_sigterm_saves_and_the_run_goes_on_bit_for_bit_with_other_workers(recipe, finished, tmp_path, capsys):
     def send(facts) -> None:
         if facts["step"] == 3:
