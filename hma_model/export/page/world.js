@@ -50,9 +50,9 @@ export async function readManifest() {
   let answer;
   try { answer = await fetch("manifest.json", { cache: "no-cache" }); }
   catch { throw new Error("manifest.json cannot be loaded: is the host reachable?"); }
-  if (!answer.ok) throw new Error("manifest.json is missing here: this page belongs into a folder of hma export");
+  if (!answer.ok) throw new Error("manifest.json is missing here: copy the page into a folder that hma export made");
   const manifest = await answer.json().catch(() => ({}));
-  if (manifest.format !== "hma-export" || manifest.format_version !== 1 || !manifest.page) throw new Error("manifest.json is not that of an export which this page reads");
+  if (manifest.format !== "hma-export" || manifest.format_version !== 1 || !manifest.page) throw new Error("manifest.json is of another version of hma export: export again");
   return manifest;
 }
 

@@ -299,7 +299,7 @@ def test_a_truncated_graph_and_a_missing_manifest_are_one_clear_line(page, serve
     (folder / "manifest.json").unlink()
     page.evaluate("caches.delete('hma-export')")
     page.reload()
-    assert said(page) == "manifest.json is missing here: this page belongs into a folder of hma export"
+    assert said(page) == "manifest.json is missing here: copy the page into a folder that hma export made"
 
 
 @pytest.mark.parametrize(
