@@ -23,7 +23,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/loading": (1_278, 10_753, 6),
     "hma_data/registry": (1_268, 8_196, 6),
     "hma_data/shards": (2_497, 19_195, 11),
-    "hma_data/sources": (12_584, 103_802, 51),
+    "hma_data/sources": (12_587, 103_842, 51),
     "hma_data/storage": (1_697, 11_105, 11),
     "hma_data/tokenizers": (3_464, 25_269, 18),
     "hma_model": (568, 3_417, 4),
@@ -44,7 +44,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_689, 30_261, 20),
     "hma_model/worlds": (1_478, 11_069, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_517, 515_963
+PRODUCT_LINES, PRODUCT_NODES = 65_520, 516_003
 TEST_LINES = 48_484
 DOC_WORDS = 41_997
 

@@ -87,6 +87,9 @@ def inspect(uri: str, finder: EpisodeFinder, episodes: int, pattern: str | None 
             if not first.keys:
                 first = _first(name, group, place)
                 _end_to_end(name, group, place, survey)
+            elif first.rate is None and name in chosen:  # the first one's times may be damaged
+                timed = _first(name, group, place)
+                first = timed if timed.rate else first
             held.update(sizes)
             series = [key for key, info in first.keys.items() if info.kind in ("camera", "vector")]
             series = [key for key in series if not is_video(key)]

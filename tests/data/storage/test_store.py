@@ -70,7 +70,7 @@ def test_paths_and_file_uris_of_this_machine_stay_what_they_are(name: str) -> No
 
 
 def test_a_scheme_that_no_store_has_is_refused() -> None:
-    with pytest.raises(StorageError, match="foo://bucket/set: is of no store that is known"):
+    with pytest.raises(StorageError, match="foo://bucket/set: is in no known store"):
         place("foo://bucket/set")
 
 
