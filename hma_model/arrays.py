@@ -1,12 +1,8 @@
-"""Name the arrays that several packages take and give; choose evenly spaced items."""
+"""Choose evenly spaced items."""
 
 import numpy as np
 
-from hma_data.arrays import Bools as Bools
-from hma_data.arrays import Float32s as Float32s
-from hma_data.arrays import Floats as Floats
-from hma_data.arrays import Images as Images
-from hma_data.arrays import Ints as Ints
+from hma_data.arrays import Ints
 
 
 def evenly(count: int, most: int) -> Ints:

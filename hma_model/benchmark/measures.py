@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hma_model.arrays import Float32s, Floats, Images
+from hma_data.arrays import Float32s, Floats, Images
 from hma_model.evaluation.agreement import share_interval
 from hma_model.evaluation.intervals import NATURAL, horizon_summary, rounded, summary
 from hma_model.evaluation.metrics import PSNR_LIMIT, PSNR_RANGE, psnr

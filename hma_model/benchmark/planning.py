@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtri
 
+from hma_data.arrays import Bools, Float32s, Floats, Images
 from hma_data.lab import truth
-from hma_model.arrays import Bools, Float32s, Floats, Images
 from hma_model.evaluation.agreement import share_interval
 from hma_model.evaluation.intervals import rounded
 from hma_model.evaluation.probe import Probe

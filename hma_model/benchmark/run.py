@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
+from hma_data.arrays import Bools
 from hma_data.errors import HMAError, OutputError, UsageError
 from hma_data.lab import FAMILY
 from hma_data.storage.files import remove_dead_parts, write_atomic
 from hma_data.storage.kept import KeptParts, remove_kept
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
-from hma_model.arrays import Bools
 from hma_model.benchmark.measures import (
     Arrays,
     choice_figures,

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hma_data.arrays import Ints
 from hma_data.loading.dataset import Batch
-from hma_model.arrays import Ints
 
 
 def shuffled(batch: Batch, begin: int = 0, seed: int = 0, draw: int = 0) -> Batch:

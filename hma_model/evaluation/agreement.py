@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from scipy import stats
 from scipy.special import betaincinv
 
-from hma_model.arrays import Bools, Floats, Ints
+from hma_data.arrays import Bools, Floats, Ints
 
 RESAMPLES = 2000
 MIN_POLICIES, MIN_EPISODES = 3, 8  # fewer say nothing about a correlation

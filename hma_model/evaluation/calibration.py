@@ -21,7 +21,7 @@ import numpy as np
 from pydantic import FiniteFloat, TypeAdapter
 from scipy.optimize import isotonic_regression
 
-from hma_model.arrays import Bools, Floats, Ints
+from hma_data.arrays import Bools, Floats, Ints
 from hma_model.config import HMAConfig
 from hma_model.evaluation.agreement import independent, share_interval
 from hma_model.evaluation.intervals import LEVELS, NATURAL, resampled_means, rounded, summary

@@ -20,13 +20,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from hma_data.arrays import Floats, Ints
 from hma_data.errors import UsageError
 from hma_data.loading.dataset import Batch, WindowDataset
 from hma_data.loading.views import Cameras
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.paths import StrPath
 from hma_data.tokenizers.base import Tokenizer
-from hma_model.arrays import Floats, Ints
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.config import OBJECTIVES
 from hma_model.evaluation.actions import gaussian, shuffled, without_actions

@@ -16,12 +16,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hma_data.arrays import Floats, Ints
 from hma_data.errors import UsageError
 from hma_data.loading.dataset import Batch, WindowDataset
 from hma_data.loading.views import FIRST_CAMERA, Cameras, Views
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.paths import StrPath
-from hma_model.arrays import Floats, Ints, evenly
+from hma_model.arrays import evenly
 from hma_model.config import OBJECTIVES, HMAConfig
 from hma_model.evaluation.metrics import teacher_forced
 from hma_model.network.model import HMA

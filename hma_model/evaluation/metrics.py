@@ -17,9 +17,9 @@ from scipy.ndimage import uniform_filter
 from torch import Tensor
 from torch.nn.functional import cross_entropy
 
+from hma_data.arrays import Floats
 from hma_data.errors import UsageError
 from hma_data.loading.dataset import Batch
-from hma_model.arrays import Floats
 from hma_model.evaluation.intervals import NATURAL, Episodes, ends_of, interval
 from hma_model.network.conditioning import Groups, align
 from hma_model.network.copying import known_digits

@@ -23,10 +23,10 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hma_data.arrays import Floats, Images, Ints
 from hma_data.errors import UsageError
 from hma_data.storage.files import file_sha256
 from hma_data.storage.paths import StrPath, as_text
-from hma_model.arrays import Floats, Images, Ints
 
 Network = Callable[[Tensor], Tensor]
 I3D_SIDE = 224  # pixels of the short side of I3D's videos

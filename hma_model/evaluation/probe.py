@@ -13,11 +13,11 @@ from functools import partial
 import numpy as np
 from torch import nn
 
+from hma_data.arrays import Bools, Floats, Images, Ints
 from hma_data.episodes.images import prepare
 from hma_data.lab import pusht, simulator, truth
 from hma_data.lab.pusher import Tee, rotation
 from hma_data.tokenizers.base import Tokenizer
-from hma_model.arrays import Bools, Floats, Images, Ints
 from hma_model.evaluation.kept import kept_reader
 from hma_model.evaluation.state_reader import (
     INPUT_SIDE,

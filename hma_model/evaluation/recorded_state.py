@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor, nn
 
+from hma_data.arrays import Floats, Images, Ints
 from hma_data.loading.dataset import Batch, WindowDataset
 from hma_data.loading.views import Cameras
 from hma_data.shards.manifest import MANIFEST
@@ -27,7 +28,7 @@ from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import mask_columns
 from hma_data.storage.files import file_sha256
 from hma_data.tokenizers.base import Tokenizer
-from hma_model.arrays import Floats, Images, Ints, evenly
+from hma_model.arrays import evenly
 from hma_model.evaluation.intervals import NATURAL, horizon_summary, rounded
 from hma_model.evaluation.kept import kept_reader
 from hma_model.evaluation.losses import episodes_of

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from hma_data.arrays import Images, Ints
 from hma_data.console import human_count
 from hma_data.errors import HMAError
 from hma_data.loading.dataset import Batch
@@ -22,7 +23,7 @@ from hma_data.shards.reader import ShardSet
 from hma_data.shards.recorded import Recorded
 from hma_data.storage.files import to_json, write_atomic
 from hma_data.storage.paths import StrPath, as_path
-from hma_model.arrays import Images, Ints, evenly
+from hma_model.arrays import evenly
 from hma_model.config import token_words
 from hma_model.evaluation.losses import windows
 from hma_model.evaluation.pages import Page

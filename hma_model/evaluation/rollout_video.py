@@ -12,6 +12,7 @@ from typing import Unpack
 
 import numpy as np
 
+from hma_data.arrays import Bools, Float32s, Images
 from hma_data.episodes.sheets import (
     gif_bytes,
     grid,
@@ -29,7 +30,7 @@ from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import write_atomic
 from hma_data.storage.paths import StrPath, as_path
 from hma_data.tokenizers.base import Tokenizer
-from hma_model.arrays import Bools, Float32s, Images, evenly
+from hma_model.arrays import evenly
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.evaluation.actions import shuffled
 from hma_model.evaluation.losses import no_window, windows

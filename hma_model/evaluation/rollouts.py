@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hma_data.arrays import Bools, Images
 from hma_data.errors import UsageError
 from hma_data.loading.dataset import Batch
 from hma_data.tokenizers.base import Tokenizer
-from hma_model.arrays import Bools, Images
 from hma_model.generation.commands import OutsideRangeWarning
 from hma_model.generation.decode import decode, default_prompt
 from hma_model.network.model import HMA

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from hma_data.arrays import Floats
 from hma_data.loading.dataset import Batch
-from hma_model.arrays import Floats
 from hma_model.evaluation.actions import shuffled, without_actions
 from hma_model.evaluation.intervals import NATURAL, Episodes, horizon_summary
 from hma_model.evaluation.metrics import PSNR_LIMIT, PSNR_RANGE, SSIM_RANGE, psnr, ssim

@@ -18,10 +18,10 @@ from typing import Any, Unpack
 import numpy as np
 import torch
 
+from hma_data.arrays import Float32s, Floats, Images
 from hma_data.lab import simulator, truth
 from hma_data.loading.dataset import Batch
 from hma_data.tokenizers.base import Tokenizer
-from hma_model.arrays import Float32s, Floats, Images
 from hma_model.evaluation.actions import shuffled, without_actions
 from hma_model.evaluation.intervals import NATURAL, horizon_summary, rounded, summary
 from hma_model.evaluation.metrics import PSNR_LIMIT, PSNR_RANGE, perplexity_summary, psnr, teacher_forced

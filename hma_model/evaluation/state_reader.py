@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from hma_data.arrays import Floats, Images
 from hma_data.episodes.images import resize
-from hma_model.arrays import Floats, Images
 
 Tell = Callable[[str], None]  # is called with how far it is
 INPUT_SIDE, MAP_SIDE = 64, 32  # pixels of the images that a network sees, and cells of its maps

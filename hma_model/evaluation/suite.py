@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from hma_data.arrays import Floats
 from hma_data.console import progress, short_paths
 from hma_data.errors import OutputError, UsageError
 from hma_data.lab.simulator import simulated
@@ -32,7 +33,6 @@ from hma_data.storage.files import file_sha256, finite, short_sha256
 from hma_data.storage.kept import KeptParts
 from hma_data.storage.paths import StrPath, as_path, as_text
 from hma_data.tokenizers.base import Tokenizer
-from hma_model.arrays import Floats
 from hma_model.checkpoint.io import record_locally
 from hma_model.evaluation.evaluate import EvaluationSettings, WindowPlan, measure
 from hma_model.evaluation.perceptual import Networks

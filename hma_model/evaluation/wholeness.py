@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hma_data.arrays import Bools, Floats, Images
 from hma_data.episodes.images import opencv
 from hma_data.lab import truth
 from hma_data.lab.truth import TrueEpisode
 from hma_data.tokenizers.base import Tokenizer
-from hma_model.arrays import Bools, Floats, Images
 from hma_model.evaluation.probe import as_seen
 from hma_model.evaluation.rollouts import rollout
 from hma_model.evaluation.simulated import as_batch

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from hma_data.arrays import Bools, Float32s
 from hma_data.errors import CheckpointError, HMAError
 from hma_data.registry.embodiment import Embodiment, find
-from hma_model.arrays import Bools, Float32s
 from hma_model.checkpoint.folder import Checkpoint
 from hma_model.network.network import Network
 

@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hma_data.arrays import Images
 from hma_data.errors import UsageError
 from hma_data.loading.views import FIRST_CAMERA, Cameras, view_count
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.paths import StrPath, as_text
 from hma_data.tokenizers.base import Tokenizer
 from hma_data.tokenizers.network import NetworkTokenizer
-from hma_model.arrays import Images
 from hma_model.checkpoint.folder import EMBEDDED_NAME, resolve
 from hma_model.network.model import HMA
 from hma_model.network.network import Network

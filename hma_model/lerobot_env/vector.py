@@ -14,10 +14,10 @@ from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from hma_data.arrays import Bools, Float32s, Ints
 from hma_data.errors import UsageError
 from hma_data.lab.simulator import simulated
 from hma_data.sources.lerobot.writer import SYNTHETIC
-from hma_model.arrays import Bools, Float32s, Ints
 from hma_model.checkpoint.folder import Checkpoint
 from hma_model.evaluation.recorded_state import (
     EPISODES_NEEDED,

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from hma_data.arrays import Images
 from hma_data.episodes.images import decode_image, opencv
 from hma_data.episodes.sheets import gif_bytes, write_mp4, write_text
 from hma_data.registry.embodiment import Embodiment
 from hma_data.registry.export import packed_components
 from hma_data.sources.lerobot.writer import LeRobotEpisode, write_lerobot
-from hma_model.arrays import Images
 from hma_model.play.session import Frame, Session
 from hma_model.worlds.scenes import Drivable
 

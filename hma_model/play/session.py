@@ -14,9 +14,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from hma_data.arrays import Float32s, Images
 from hma_data.episodes.images import opencv, resize
 from hma_data.errors import UsageError
-from hma_model.arrays import Float32s, Images
 from hma_model.evaluation.calibration import POWER
 from hma_model.evaluation.metrics import PSNR_LIMIT, psnr
 from hma_model.generation.unmask import Decoding

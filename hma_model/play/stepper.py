@@ -20,9 +20,9 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+from hma_data.arrays import Float32s
 from hma_data.errors import HMAError, UsageError
 from hma_data.storage.kinds import one_line
-from hma_model.arrays import Float32s
 from hma_model.generation.unmask import Decoding
 from hma_model.play.session import Session, Viewer
 from hma_model.worlds.scenes import Drivable

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from hma_data.arrays import Float32s
 from hma_data.errors import HMAError, UsageError
-from hma_model.arrays import Float32s
 from hma_model.config import POLICY
 from hma_model.policies.arenas import Arena, Scenes
 from hma_model.policies.base import split_options

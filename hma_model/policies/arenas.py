@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.arrays import Float32s, Floats, Images
 from hma_data.episodes.images import resize
 from hma_data.errors import HMAError, UsageError
 from hma_data.lab import FAMILY, truth
 from hma_data.lab.scripted import PUSHER, SceneState, SeenState, seen_state, state_of, steerable
 from hma_data.lab.simulator import LabSimulator, simulated
-from hma_model.arrays import Float32s, Floats, Images
 from hma_model.evaluation.probe import Probe
 from hma_model.generation.commands import OutsideRangeWarning, described
 from hma_model.worlds.env import WorldModelVectorEnv

@@ -13,8 +13,8 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import torch
 
+from hma_data.arrays import Float32s
 from hma_data.errors import HMAError, UsageError
-from hma_model.arrays import Float32s
 from hma_model.policies.arenas import Arena
 from hma_model.policies.judge import StateJudge
 

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from hma_data.arrays import Bools, Floats, Images
 from hma_data.errors import HMAError, UsageError
 from hma_data.lab import truth
 from hma_data.tokenizers.base import Tokenizer
-from hma_model.arrays import Bools, Floats, Images
 from hma_model.evaluation.agreement import Accuracy, accuracy
 from hma_model.evaluation.kept import Arrays, kept, weights_sha256
 from hma_model.evaluation.probe import EPISODES, FIRST_EPISODE, Probe, as_seen, as_shown, train_probe

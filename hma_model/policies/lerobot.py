@@ -13,11 +13,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from hma_data.arrays import Float32s, Images
 from hma_data.errors import HMAError
 from hma_data.hub.repository import Repository
 from hma_data.lab import imported
 from hma_data.storage.paths import REPOSITORY
-from hma_model.arrays import Float32s, Images
 from hma_model.policies.arenas import Arena, Scenes
 
 STATE, TASK = "observation.state", "task"

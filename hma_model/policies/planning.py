@@ -21,9 +21,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from hma_data.arrays import Float32s, Floats, Images
 from hma_data.episodes.images import resize
 from hma_data.errors import HMAError, MissingDependencyError, UsageError, install_command
-from hma_model.arrays import Float32s, Floats, Images
 from hma_model.policies.acting import Follower
 from hma_model.policies.arenas import Arena, Scenes
 from hma_model.policies.base import split_options

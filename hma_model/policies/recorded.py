@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.arrays import Bools, Floats, Images
 from hma_data.console import human_count, print_table
 from hma_data.episodes.sheets import grid, png_bytes
 from hma_data.errors import UsageError
@@ -26,7 +27,7 @@ from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import short_sha256
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
-from hma_model.arrays import Bools, Floats, Images, evenly
+from hma_model.arrays import evenly
 from hma_model.evaluation.agreement import alike_pairs, share_interval
 from hma_model.evaluation.pages import Page
 from hma_model.generation.decode import cameras_for

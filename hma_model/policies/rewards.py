@@ -21,10 +21,10 @@ from unittest.mock import patch
 import numpy as np
 import torch
 
+from hma_data.arrays import Bools, Floats, Images
 from hma_data.errors import HMAError, MissingDependencyError, UsageError
 from hma_data.lab import imported
 from hma_data.shards.reader import ShardSet
-from hma_model.arrays import Bools, Floats, Images
 from hma_model.evaluation.agreement import Accuracy, accuracy, by_scene, independent, share_interval
 from hma_model.evaluation.state_reader import Tell
 from hma_model.generation.decode import cameras_for, trained_shards

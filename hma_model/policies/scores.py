@@ -28,12 +28,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.arrays import Bools, Float32s, Floats, Images, Ints
 from hma_data.errors import HMAError, UsageError
 from hma_data.storage.files import short_sha256
 from hma_data.storage.kept import KeptParts
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
-from hma_model.arrays import Bools, Float32s, Floats, Images, Ints, evenly
+from hma_model.arrays import evenly
 from hma_model.evaluation.agreement import (
     Accuracy,
     Estimate,

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from hma_data.arrays import Float32s
 from hma_data.errors import UsageError
 from hma_data.lab.scripted import driver, reacher, steerable
-from hma_model.arrays import Float32s
 from hma_model.policies.arenas import Arena
 
 

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.arrays import Bools, Float32s, Floats
 from hma_data.errors import HMAError, UsageError
 from hma_data.lab.scripted import steerable
 from hma_data.lab.simulator import embodiment, simulated
@@ -30,7 +31,6 @@ from hma_data.storage.files import short_sha256
 from hma_data.storage.kept import KeptParts, remove_kept
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
-from hma_model.arrays import Bools, Float32s, Floats
 from hma_model.evaluation.calibration import Meter, accumulated
 from hma_model.evaluation.probe import Probe, train_probe
 from hma_model.evaluation.recorded_state import EPISODES_NEEDED, Reader, recorded_reader, simulated_reader

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.arrays import Bools, Float32s, Ints
 from hma_data.errors import EpisodeError, UsageError
 from hma_data.loading.views import Cameras, Views, view_count
 from hma_data.registry.embodiment import Embodiment
@@ -25,7 +26,6 @@ from hma_data.shards.windows import episode_pieces
 from hma_data.sources.common.video_file import VideoFile, frame_table
 from hma_data.storage.files import file_sha256, short_sha256
 from hma_data.storage.paths import StrPath, as_path
-from hma_model.arrays import Bools, Float32s, Ints
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.generation.commands import described
 from hma_model.generation.decode import trained_cameras

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from hma_data.arrays import Float32s, Floats
 from hma_data.errors import EpisodeError, HMAError, OutputError, UsageError
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.reader import ShardSet
@@ -27,7 +28,6 @@ from hma_data.storage.files import short_sha256
 from hma_data.storage.kept import KeptParts, remove_kept
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
-from hma_model.arrays import Float32s, Floats
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.config import INVERSE
 from hma_model.evaluation.intervals import ends_of, interval

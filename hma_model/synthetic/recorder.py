@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.arrays import Float32s
 from hma_data.conversion.plan import Settings, make_plan
 from hma_data.errors import OutputError
 from hma_data.registry.embodiment import Embodiment
@@ -27,7 +28,6 @@ from hma_data.sources.lerobot import writer as lerobot_writer
 from hma_data.sources.lerobot.writer import LeRobotEpisode, write_lerobot
 from hma_data.storage.files import new_folder
 from hma_data.tokenizers.base import Tokenizer, TokenizerSpec
-from hma_model.arrays import Float32s
 from hma_model.evaluation.recorded_state import Reader
 from hma_model.play.save import embodiment_of
 from hma_model.worlds.prompts import SeenShards

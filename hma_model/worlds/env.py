@@ -20,10 +20,10 @@ import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from numpy.typing import NDArray
 
+from hma_data.arrays import Float32s, Images, Ints
 from hma_data.episodes.images import resize
 from hma_data.errors import HMAError, UsageError
 from hma_data.storage.paths import StrPath
-from hma_model.arrays import Float32s, Images, Ints
 from hma_model.generation.commands import OutsideRangeWarning
 from hma_model.worlds.images import Prompt
 from hma_model.worlds.prompts import read_prompt

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hma_data.arrays import Float32s, Images
 from hma_data.episodes.images import decode_image, resize
 from hma_data.episodes.sheets import cell_scale, first_of_grid
 from hma_data.errors import EpisodeError, HMAError, UsageError
@@ -16,7 +17,6 @@ from hma_data.loading.views import Cameras
 from hma_data.registry.embodiment import Embodiment
 from hma_data.storage.kinds import misplaced
 from hma_data.storage.paths import StrPath, as_path
-from hma_model.arrays import Float32s, Images
 from hma_model.checkpoint.folder import SAMPLE, Checkpoint
 from hma_model.config import HMAConfig
 

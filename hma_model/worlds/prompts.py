@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hma_data.arrays import Bools, Float32s, Ints
 from hma_data.episodes.align import pauses, to_clip
 from hma_data.episodes.images import prepared
 from hma_data.errors import HMAError, UsageError
@@ -25,7 +26,6 @@ from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.windows import episode_pieces, pieces
 from hma_data.sources.base import open_source
 from hma_data.storage.paths import StrPath, as_path
-from hma_model.arrays import Bools, Float32s, Ints
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.generation.commands import described, yaml_of
 from hma_model.generation.decode import cameras_for, trained_cameras, trained_shards

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hma_data.arrays import Float32s, Floats, Images
 from hma_data.episodes.images import resize
 from hma_data.errors import UsageError
 from hma_data.lab.simulator import SIZE, LabSimulator, simulated
@@ -30,7 +31,6 @@ from hma_data.registry.components import Component
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.windows import episode_pieces
-from hma_model.arrays import Float32s, Floats, Images
 from hma_model.checkpoint.folder import Checkpoint, require_tokenizer
 from hma_model.worlds.images import (
     Prompt,

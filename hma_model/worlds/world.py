@@ -20,10 +20,10 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
+from hma_data.arrays import Float32s, Images
 from hma_data.errors import HMAError
 from hma_data.storage.paths import StrPath
 from hma_data.tokenizers.base import Tokenizer, reopened
-from hma_model.arrays import Float32s, Images
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.evaluation.calibration import Meter, meter_of
 from hma_model.generation.commands import Commands, card, described
