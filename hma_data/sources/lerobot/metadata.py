@@ -12,12 +12,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from pydantic import BaseModel, Field, NonNegativeInt, PositiveFloat, PositiveInt, ValidationError
 
 from hma_data.errors import EpisodeError, HMAError, SourceError
+from hma_data.sources.common.places import require_inside
 from hma_data.storage.kinds import one_line, unreadable
 from hma_data.storage.yaml_io import first_fault
 
@@ -127,12 +129,15 @@ class Folder:
         if not (self.root / "meta" / "info.json").is_file():
             there = "has no meta/info.json" if self.root.exists() else "does not exist"
             raise SourceError(uri, there, "give the folder of a whole LeRobotDataset, or its name on the Hub")
+        meta = self.root / "meta"
+        for path in chain([meta], meta.rglob("*")):  # of its links to folders, none is entered
+            require_inside(path, self.root)
 
     def path(self, relative: str) -> Path:
         """Return the local path of a file, which need not exist.
 
         Raises:
-            EpisodeError: the path leads out of the folder.
+            EpisodeError: the path leads out of the folder, by itself or by a link.
             SourceError: the Hub cannot be reached.
         """
         pure = PurePosixPath(relative)
@@ -140,7 +145,10 @@ class Folder:
             fault = f"names a file outside the dataset: {relative!r}"
             raise EpisodeError(self.uri, fault, "correct the paths in meta/info.json or in its rows")
         path = self.root / relative
-        return self._fetch(self.repo, relative) if self.repo and not path.is_file() else path
+        if self.repo and not path.is_file():
+            return self._fetch(self.repo, relative)
+        require_inside(path, self.root)
+        return path
 
     def _fetch_meta(self, repo: str) -> Path:
         from huggingface_hub import snapshot_download

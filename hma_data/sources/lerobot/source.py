@@ -180,8 +180,8 @@ def _fingerprint(meta: Metadata, index: int, samples: dict[str, str]) -> str:
         parts += [f"{span.start} {span.stop}" for span in spans]
         files = [(meta.data_path(index), file_fingerprint), *((span.path, _video_sample) for span in spans)]
         for relative, sample in [] if meta.folder.repo else files:
-            path = meta.folder.path(relative)
             if relative not in samples:
+                path = meta.folder.path(relative)
                 samples[relative] = sample(path) if path.is_file() else "missing"
             parts.append(samples[relative])
     except EpisodeError as fault:  # `read` raises it again

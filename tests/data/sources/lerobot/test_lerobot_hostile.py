@@ -11,7 +11,7 @@ import pytest
 from hma_data.sources.lerobot import rows
 from tests.data.sources.lerobot.test_lerobot import embodiment
 from tests.data.videos import CAMERA, STILL, encode, make_v2, make_v3
-from tests.hostile import Edit, Row, check_refused, cut, of, swap, untouched, values, whole
+from tests.hostile import Edit, Row, check_refused, cut, linked_away, of, swap, untouched, values, whole
 
 INFO, LISTED, TASKS = "meta/info.json", "meta/episodes.jsonl", "meta/tasks.jsonl"
 ROWS, FILM = "data/chunk-000/episode_000000.parquet", f"videos/chunk-000/{CAMERA}/episode_000000.mp4"
@@ -78,12 +78,17 @@ ONE: dict[str, Row] = {  # one episode is refused
         "'frame_index' is 7, which is not the index of a task",
         TOLD_BY_NUMBER,
     ),
+    "a film that is a link": (of(FILM, linked_away), r"episode_000000\.mp4: is a link to a file outside"),
+    "rows that are a link": (of(ROWS, linked_away), r"episode_000000\.parquet: is a link to a file outside"),
     "pictures elsewhere": (column(STILL, [{"path": "../../etc/passwd"}] * 12), "outside the dataset", STILLS),
 }
 ALL: dict[str, Row] = {  # no episode can be used
     "v3: a film is missing": (of("**/*.mp4", Path.unlink), r"file-000\.mp4: no such video"),
     "v3: no info": (of(INFO, Path.unlink), NO_INFO),
     "no info": (of(INFO, Path.unlink), NO_INFO),
+    "info that is a link": (of(INFO, linked_away), r"info\.json: is a link to a file outside"),
+    "v3: a folder of links": (of("meta", linked_away), r"set/meta: is a link to a file outside"),
+    "v3: films elsewhere": (of("videos", linked_away), r"file-000\.mp4: is a link to a file outside"),
     "an old version": (info(codebase_version="v1.6"), r"info\.json.*'v1\.6'; v2\.0, v2\.1, v3\.0 are read"),
     "no version": (info(codebase_version=None), r"info\.json.*version None"),
     "fps of 0": (info(fps=0), r"info\.json.*fps is 0: must be greater than 0"),
