@@ -16,7 +16,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data": (744, 4_321, 8),
     "hma_data/cli": (1_540, 10_986, 8),
     "hma_data/conversion": (4_134, 30_555, 15),
-    "hma_data/episodes": (1_710, 14_575, 9),
+    "hma_data/episodes": (1_724, 14_774, 9),
     "hma_data/hub": (517, 3_857, 3),
     "hma_data/inspection": (2_129, 20_225, 8),
     "hma_data/lab": (3_318, 29_457, 16),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_689, 30_261, 20),
     "hma_model/worlds": (1_478, 11_069, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_530, 516_052
-TEST_LINES = 48_491
+PRODUCT_LINES, PRODUCT_NODES = 65_544, 516_251
+TEST_LINES = 48_492
 DOC_WORDS = 41_997
 
 

@@ -181,7 +181,7 @@ def test_a_mosaic_that_was_made_colour_before_is_left_as_it_is(tmp_path: Path) -
 
 def test_a_mosaic_of_16_bits_is_refused(tmp_path: Path) -> None:
     path = mosaic_bag(tmp_path / "run", "bayer_rggb16; png compressed ", np.full((32, 32), 4000, np.uint16))
-    with pytest.raises(EpisodeError, match="16 bits of grey"):
+    with pytest.raises(EpisodeError, match="more than 8 bits of grey"):
         only_frame(path)
 
 
