@@ -16,14 +16,14 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data": (744, 4_321, 8),
     "hma_data/cli": (1_540, 10_986, 8),
     "hma_data/conversion": (4_134, 30_555, 15),
-    "hma_data/episodes": (1_724, 14_774, 9),
+    "hma_data/episodes": (1_736, 14_832, 9),
     "hma_data/hub": (517, 3_857, 3),
     "hma_data/inspection": (2_129, 20_225, 8),
     "hma_data/lab": (3_318, 29_457, 16),
     "hma_data/loading": (1_278, 10_753, 6),
     "hma_data/registry": (1_268, 8_196, 6),
     "hma_data/shards": (2_497, 19_195, 11),
-    "hma_data/sources": (12_595, 103_893, 51),
+    "hma_data/sources": (12_597, 103_917, 51),
     "hma_data/storage": (1_697, 11_105, 11),
     "hma_data/tokenizers": (3_464, 25_269, 18),
     "hma_model": (564, 3_409, 4),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_689, 30_261, 20),
     "hma_model/worlds": (1_478, 11_069, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_544, 516_251
-TEST_LINES = 48_492
+PRODUCT_LINES, PRODUCT_NODES = 65_558, 516_333
+TEST_LINES = 48_512
 DOC_WORDS = 41_997
 
 

@@ -26,6 +26,11 @@ BLANK_LEVELS = 8  # levels from the darkest to the brightest coarse block: 3 % o
 STILL_LEVELS = 4  # levels by which a fine block changes
 BT601, OTHER_MATRICES = 5, (1, 7, 9)  # FFmpeg's AVCOL_SPC: BT.709, SMPTE 240M and BT.2020 differ from BT.601
 DEPTH_BITS = 12  # of one channel, at least; cameras of grey have 8 or 10
+HDR = {16: "PQ", 18: "HLG"}  # FFmpeg's AVCOL_TRC
+TO_SDR = (
+    "tone-map it: ffmpeg -i IN -vf zscale=t=linear:npl=100,format=gbrpf32le,zscale=p=bt709,tonemap=hable,"
+    "zscale=t=bt709:m=bt709:r=tv,format=yuv420p -fps_mode passthrough OUT"
+)
 LIMITED, FULL = 1, 2  # FFmpeg's AVCOL_RANGE: luma of 16 to 235, or of 0 to 255
 
 
@@ -98,6 +103,13 @@ def _short_side(jpeg: memoryview) -> int:
             return min(int.from_bytes(jpeg[at + 5 : at + 7]), int.from_bytes(jpeg[at + 7 : at + 9]))
         at += 1 if marker == 0xFF else 2 + int.from_bytes(jpeg[at + 2 : at + 4])
     return 0
+
+
+def refuse_hdr(context: Any, where: str) -> None:
+    """Raise EpisodeError if a decoder (PyAV's codec context) that has given a frame gives HDR video."""
+    if transfer := HDR.get(int(context.color_trc)):
+        fault = f"the video is HDR ({transfer}): without tone mapping its images are grey and flat"
+        raise EpisodeError(where, fault, TO_SDR)
 
 
 class FrameToRGB:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from hma_data.arrays import Bools, Floats, Images, Indices, Ints
 from hma_data.episodes.episode import OneByOne, of_one_size
-from hma_data.episodes.images import MAX_PIXELS, FrameToRGB, decode_image, image_codec, opencv
+from hma_data.episodes.images import MAX_PIXELS, FrameToRGB, decode_image, image_codec, opencv, refuse_hdr
 from hma_data.errors import EpisodeError
 from hma_data.sources.bags.bag import Bag
 from hma_data.sources.bags.container import Channel
@@ -409,6 +409,7 @@ class VideoDecoder:
             raise EpisodeError(
                 self._where, f"frame {wanted} of the video cannot be decoded: {fault}"
             ) from fault
+        refuse_hdr(self._context, self._where)
         if data is None:
             self._context = None
         else:

@@ -21,7 +21,7 @@ import numpy as np
 
 from hma_data.arrays import Floats, Images, Indices, Ints
 from hma_data.episodes.episode import OneByOne, all_of, of_one_size
-from hma_data.episodes.images import MAX_PIXELS, FrameToRGB
+from hma_data.episodes.images import MAX_PIXELS, FrameToRGB, refuse_hdr
 from hma_data.errors import EpisodeError
 from hma_data.storage.kinds import unreadable
 
@@ -72,7 +72,7 @@ def frame_table(path: Path) -> FrameTable:
     """Return the frames of a video file; only the first is decoded, for its size.
 
     Raises:
-        EpisodeError: there is no such file, no video in it, or it is damaged.
+        EpisodeError: there is no such file, no video in it, or it is damaged or HDR.
     """
     try:
         state = path.stat()
@@ -87,6 +87,7 @@ def frame_table(path: Path) -> FrameTable:
 def _cached_table(path: str, size: int, changed: int) -> FrameTable:
     with opened(path) as (container, stream):
         size_px = decoded_size(container, stream)
+        refuse_hdr(stream.codec_context, path)
     with opened(path) as (container, stream):
         shown: list[int] = []
         keyframes: list[tuple[int, int]] = []

@@ -178,6 +178,7 @@ RED_AND_BLUE = {
 }  # shares of luma
 LIMITED, FULL = 1, 2
 OPTIONS = {"libx264": {"crf": "1"}, "libvpx-vp9": {"crf": "4"}, "ffv1": dict[str, str]()}
+OPTIONS |= {"libx265": {"x265-params": "log-level=none"}, "libsvtav1": {"preset": "12"}}
 NEAR = 4  # levels: rounding of YUV, and what the codec loses
 
 
@@ -197,13 +198,21 @@ def patches(matrix: int, full: bool, bits: int) -> list[np.ndarray]:
     return [np.rint(plane).astype(np.uint16 if bits > 8 else np.uint8) for plane in planes]
 
 
-def film(path: Path, matrix: int, full: bool, codec: str = "libx264", kind: str = "yuv420p") -> Path:
+def film(
+    path: Path,
+    matrix: int,
+    full: bool,
+    codec: str = "libx264",
+    kind: str = "yuv420p",
+    transfer: int = UNSTATED,
+) -> Path:
     spread = FULL if full else LIMITED
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=10, options=OPTIONS[codec])
         stream.width = stream.height = SIDE
         stream.pix_fmt = kind
         stream.codec_context.colorspace, stream.codec_context.color_range = matrix, spread
+        stream.codec_context.color_trc = transfer
         for number in range(3):
             frame = av.VideoFrame(SIDE, SIDE, kind)
             frame.colorspace, frame.color_range, frame.pts = matrix, spread, number
@@ -295,6 +304,17 @@ def test_grey_has_no_matrix(tmp_path: Path, kind: str, matrix: int, full: bool) 
 def test_depth_is_no_video(tmp_path: Path, kind: str) -> None:
     with pytest.raises(EpisodeError, match=rf"v\.mkv: the video has {kind[4:6]} bits of grey: depth"):
         VideoFile(film(tmp_path / "v.mkv", UNSTATED, False, "ffv1", kind)).frames([0])
+
+
+@pytest.mark.parametrize(("transfer", "name"), [(16, "PQ"), (18, "HLG")])
+def test_hdr_is_refused_with_what_tone_maps_it(tmp_path: Path, transfer: int, name: str) -> None:
+    said = rf"is HDR \({name}\): .* — tone-map it: ffmpeg .*tonemap"
+    for codec in ("libx264", "libx265", "libsvtav1"):
+        path = film(tmp_path / f"{codec}.mp4", BT2020, False, codec, "yuv420p10le", transfer)
+        with pytest.raises(EpisodeError, match=rf"{codec}\.mp4: the video {said}"):
+            VideoFile(path)
+    with pytest.raises(EpisodeError, match=rf"v\.mcap /video: the video {said}"):
+        from_bag(h264_messages(tmp_path / "libx264.mp4"))
 
 
 @pytest.mark.parametrize("matrix", [UNSTATED, BT709])
