@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, TypeGuard
 
 import h5py
 import numpy as np
@@ -433,6 +433,11 @@ def dataset(group: h5py.Group, key: str, where: str) -> h5py.Dataset:
 def is_elsewhere(found: h5py.Dataset, group: h5py.Group) -> bool:
     """Check whether a dataset lies in another file than its group, or keeps its values in one."""
     return bool(found.file.filename != group.file.filename or found.external or found.is_virtual)
+
+
+def is_single(found: Any, group: h5py.Group) -> TypeGuard[h5py.Dataset]:
+    """Check whether something is a dataset of one value that lies in the same file as a group."""
+    return isinstance(found, h5py.Dataset) and found.size == 1 and not is_elsewhere(found, group)
 
 
 def is_plausible(found: h5py.Dataset) -> bool:

@@ -1,6 +1,6 @@
 """Inspect HDF5 recordings without an embodiment: their keys, their lengths, and what looks wrong."""
 
-import math
+import re
 from collections import Counter
 from collections.abc import Container, Iterator
 from contextlib import suppress
@@ -28,7 +28,9 @@ from hma_data.sources.hdf5.file import (
     RecordedRows,
     dataset,
     explained,
+    inside,
     is_plausible,
+    is_single,
     json_of,
     masks_of,
     numbers,
@@ -40,6 +42,7 @@ from hma_data.sources.hdf5.images import ImageRows, as_rgb, encoded, image_kind,
 from hma_data.sources.hdf5.videos import is_video, video_keys, videos_beside
 
 _RATES = ("control_freq", "control_frequency", "frequency_hz", "frequency", "fps", "hz", "rate")
+MAX_HZ = 1e6
 _ENDS = ("episode_ends", "episode_lengths", "terminals", "timeouts", "dones")  # of episodes end to end
 _BESIDE = ("compress_len",)  # not rows over time: the bytes of ALOHA's JPEGs, (cameras, T)
 _MEASURED = "measured from"
@@ -237,16 +240,26 @@ def _rate(
 
 
 def _stated_rate(group: h5py.Group, said: dict[str, Any]) -> tuple[float | None, str]:
+    """Return Hz as an attribute or a dataset of one value states it, and where; None where none does."""
     places: list[tuple[str, Any]] = [("the file's env_args", said)]
-    holders = (group, group.parent, group.file)
-    places += [(f"the attributes of {holder.name}", holder.attrs) for holder in holders]
+    for holder in (group, group.parent, group.file):
+        single = {name: item[()] for name in _RATES if is_single(item := inside(holder, name), group)}
+        places += [(f"the attributes of {holder.name}", holder.attrs), (holder.name, single)]
     for place, holder in places:
         for name in _RATES:
-            value = holder.get(name)
-            number = value.item() if isinstance(value, np.generic) else value
-            if isinstance(number, int | float) and not isinstance(number, bool) and 0 < number < math.inf:
-                return float(number), f"{name} in {place}"
+            if hz := _hertz(holder.get(name)):
+                return hz, f"{name} in {place}"
     return None, ""
+
+
+def _hertz(value: Any) -> float | None:
+    """Return the rate that a number or a text such as `20 Hz` states; None where it states none."""
+    if isinstance(value, np.ndarray | np.generic) and value.size == 1:
+        value = value.item()
+    words = re.fullmatch(r"(\d+\.?\d*) ?(hz|fps)?", text(value).lower())
+    number = float(words[1]) if words else value
+    is_number = isinstance(number, int | float) and not isinstance(number, bool)
+    return float(number) if is_number and 0 < number < MAX_HZ else None
 
 
 def _keys(group: h5py.Group, place: EpisodeGroup, pixels: Container[str]) -> Iterator[KeyInfo]:
@@ -256,7 +269,8 @@ def _keys(group: h5py.Group, place: EpisodeGroup, pixels: Container[str]) -> Ite
         if key in pixels:
             sides = item.shape[1:]
             kind, shape, codec = "camera", sides if sides[2] == 3 else (*sides[1:], 3), "raw"
-        kind = "other" if key in _BESIDE else kind
+        is_rate = count == 1 and key.rsplit("/", 1)[-1] in _RATES
+        kind = "other" if is_rate or key in _BESIDE else kind
         yield KeyInfo(key, kind, shape, str(item.dtype), codec=codec, count=count)
 
 

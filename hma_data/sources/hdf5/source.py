@@ -47,6 +47,7 @@ from hma_data.sources.hdf5.file import (
     explained,
     inside,
     is_elsewhere,
+    is_single,
     json_of,
     masks_of,
     member,
@@ -273,8 +274,7 @@ def _instruction(group: h5py.Group, key: str | None, where: str) -> str:
 
 def _single_text(found: Any, group: h5py.Group) -> str:
     """Return the text of a dataset of one value; empty where it is something else."""
-    is_single = isinstance(found, h5py.Dataset) and found.size == 1 and not is_elsewhere(found, group)
-    return _first_text(found) if is_single else ""
+    return _first_text(found) if is_single(found, group) else ""
 
 
 def _first_text(found: h5py.Dataset) -> str:

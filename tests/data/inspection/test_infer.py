@@ -379,6 +379,9 @@ def test_colours_of_other_numbers_than_bytes_are_cameras_with_their_range(
     [
         ({"fps": 12}, None, 12),
         ({"fps": "fast"}, None, None),
+        ({"fps": "12.5 Hz"}, None, 12.5),
+        ({"hz": np.array([b"15"])}, None, 15),
+        ({"control_freq": "0", "rate": "-3", "frequency": "1e3"}, None, None),
         ({}, np.arange(T) * 50_000_000 + 1_700_000_000_000_000_000, 20),
         ({}, np.arange(T), None),  # counts frames
         ({}, np.arange(T) * 0.1, 10),
@@ -395,6 +398,20 @@ def test_rates_of_attributes_and_of_times_in_any_unit(tmp_path, attributes, time
     values = inferred(path)
     assert (values["frequency_hz"] == hz) if hz else ("frequency_hz" in questions(values))
     first_clip(path, values)
+
+
+@pytest.mark.parametrize(
+    ("place", "stated"),
+    [("", 12), ("data/demo_0", np.float32(12)), ("", b"12"), ("", "12 fps"), ("data/demo_0", [12])],
+)
+def test_a_rate_may_be_a_dataset_of_one_value(tmp_path: Path, place: str, stated: Any) -> None:
+    path = tmp_path / "run.hdf5"
+    with h5py.File(path, "w") as file:
+        file["data/demo_0/image"], file["data/demo_0/action"] = pictures(), numbers(T, 3)
+        file[f"{place}/fps"] = stated
+    values = inferred(path)
+    assert values["frequency_hz"] == 12 and not open_source("hdf5").inspect(str(path)).problems
+    assert values["provenance"]["frequency_hz"] == f"fps in /{place}"
 
 
 def test_a_recording_without_commands_proposes_its_own_position_as_a_question(tmp_path: Path) -> None:
