@@ -1,6 +1,7 @@
 """Read results of the benchmark, and show them: a table for a model card, a page, and two compared."""
 
 import json
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -190,12 +191,14 @@ def read_results(path: Path) -> dict[str, Any]:
         OutputError: there is none, or it is damaged.
     """
     path = path / RESULTS if path.is_dir() else path
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        if found["benchmark"] != NAME:
-            raise ValueError
-    except (OSError, ValueError, TypeError, KeyError, RecursionError):
-        raise OutputError(path, "holds no results of the benchmark", REMEDY) from None
+    with _whole(path):
+        try:
+            text = path.read_text(encoding="utf-8")
+            found = json.loads(text, parse_constant=_finite, parse_float=_finite)
+            if found["benchmark"] != NAME:
+                raise ValueError
+        except (OSError, ValueError, TypeError, KeyError, RecursionError):
+            raise OutputError(path, "holds no results of the benchmark", REMEDY) from None
     if found.pop("sha256", None) not in (None, digest(found)):  # results of older versions have none
         raise OutputError(path, "is damaged or edited: its SHA-256 does not match", REMEDY)
     with _whole(path):
@@ -204,6 +207,13 @@ def read_results(path: Path) -> dict[str, Any]:
             if wrong := [key for key, values in figures.items() if len(values) != found["scenes"]]:
                 raise ValueError(f"{wrong[0]} is not of {found['scenes']} scenes")
     return found
+
+
+def _finite(figure: str) -> float:
+    """Return a number of a JSON text; NaN and what is too large for float64 are no figures."""
+    if not math.isfinite(value := float(figure)):
+        raise ArithmeticError(f"{figure} is none")
+    return value
 
 
 def digest(found: dict[str, Any]) -> str:

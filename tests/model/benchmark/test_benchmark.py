@@ -248,6 +248,10 @@ def test_damaged_results_are_refused_with_what_to_do(folders: tuple[Path, Path],
         path.write_text(json.dumps(without | {"measures": dict.fromkeys(without["measures"], figures)}))
         with pytest.raises(OutputError, match="lacks figures"):
             read_results(path)
+    for figure in ("NaN", "-Infinity", "1e999"):
+        path.write_text(json.dumps(without).replace('"decision": 1.0', f'"decision": {figure}'))
+        with pytest.raises(OutputError, match=rf"lacks figures \(ArithmeticError: {figure} is none\)"):
+            read_results(path)
     for scenes in ([1.0], [1.0, 2.0, 3.0, 4.0], [], 7, {"a": 1}):
         edited: dict[str, Any] = json.loads(whole) | {"sha256": None}
         edited["by_scene"][ROBOT]["psnr"] = scenes
