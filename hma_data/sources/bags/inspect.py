@@ -93,7 +93,7 @@ class _Topic:
     count: int = 0
     sample: Any = None
     named: int = 0
-    fault: str = ""
+    fault: EpisodeError | None = None
     values: list[_Values] = field(default_factory=list)
     others: dict[str, Any] = field(default_factory=dict)  # by type, first messages of other types
 
@@ -257,15 +257,15 @@ class _BagInspection:
                     if len(value.held) > MAX_HELD:
                         value.hand_on(self._survey, self._name)
             except EpisodeError as fault:
-                topic.fault = fault.fault
+                topic.fault = fault
                 topic.track.add(record.channel, record.log_ns, place, None)
 
     def _keys(self, topic: _Topic) -> list[KeyInfo]:
         track, name = topic.track, topic.track.topic
         if not len(track):
             return [KeyInfo(name, "other", (), "", count=0)]
-        if topic.fault:
-            self._survey.note(Finding("readable", "warn", topic.fault, key=name))
+        if fault := topic.fault:
+            self._survey.note(Finding("readable", "warn", fault.fault, fault.remedy, name))
         stated = track.channels[0]
         kind = track.kind
         if name not in LOG_TOPICS:
@@ -317,7 +317,8 @@ class _BagInspection:
                 messages = Messages(self.bag, track.channels, track.places()[track.times.by_receipt()], name)
                 high = float(max(wide_grey(one, kind, name).max() for one in messages.read(indices)))
         except EpisodeError as fault:
-            self._survey.note(Finding("readable", "warn", f"{name}: {fault.fault}", key=name))
+            said = f"{name}: {fault.fault}"
+            self._survey.note(Finding("readable", "warn", said, fault.remedy, name))
             return KeyInfo(name, "other", (), track.channels[0].type)
         return KeyInfo(
             name,

@@ -21,6 +21,7 @@ from hma_data.sources.bags.container import Channel, Data
 Decode = Callable[[Data], Any]
 IDL_SEPARATOR = "=" * 80 + "\n"
 TIME_FIELDS = (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos"))
+PLAIN_CDR, PARAMETERS = 1, (2, 3)  # RTPS's kinds of encapsulation: 0 and 1 are plain CDR; lists in XCDR1
 WELL_KNOWN = "google/protobuf/"
 UNITS_NS = (1, 10**3, 10**6, 10**9)
 LATEST = 2.0**63  # nanoseconds since 1970
@@ -33,6 +34,11 @@ def decode(channel: Channel, data: Data, where: str) -> Any:
     Raises:
         EpisodeError: its encoding or type is unknown, or the bytes do not fit it.
     """
+    form = int.from_bytes(data[:2]) if channel.encoding == "cdr" else 0
+    if form > PLAIN_CDR:
+        kind = "a parameter list" if form in PARAMETERS else "XCDR2"
+        fault = f"a message on {channel.topic} has the encapsulation {form:#06x} ({kind}), not plain CDR"
+        raise EpisodeError(where, fault, "record again with XCDR1 as the publisher's data representation")
     # The libraries below raise almost any error for damaged definitions and bytes.
     try:
         read = _decoder(channel)

@@ -1,6 +1,7 @@
 """Bags that are cut off, damaged or hostile, and what reading leaves behind."""
 
 import contextlib
+import re
 import shutil
 import sqlite3
 from importlib import import_module
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 
 from hma_data.errors import EpisodeError
 from hma_data.sources.bags import container
-from tests.data import bag_parts
+from tests.data import bag_files, bag_parts
 from tests.data.bag_files import CAMERA, COMMAND, KINDS, SOURCE, Recording, arm
 from tests.data.sources.test_damage_anywhere import SINGLE
 from tests.hostile import Row, check_refused, cut, linked_away, of, read_all, swap, untouched, use_all
@@ -33,6 +34,19 @@ def killed(path: Path) -> None:
     """Leave the bag as a recorder does that is killed while it writes a chunk."""
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2 - 7])
     path.rename(f"{path}.active")
+
+
+@pytest.mark.parametrize(("kind", "name"), [(3, "a parameter list"), (7, "XCDR2"), (0x15, "XCDR2")])
+def test_messages_that_are_not_plain_cdr_are_refused(kind: int, name: str, recording, tmp_path) -> None:
+    def other(encoded: bag_files.Encoded) -> bag_files.Encoded:
+        return encoded._replace(encode=lambda item: bytes([0, kind]) + encoded.encode(item)[2:])
+
+    how = {topic: other(encoded) for topic, encoded in bag_files.as_cdr().items()}
+    path = bag_files.write_mcap(tmp_path / "run.mcap", recording, how)
+    said = rf"a message on /\S+ has the encapsulation {kind:#06x} \({name}\), not plain CDR — record again"
+    with pytest.raises(EpisodeError, match=said):
+        read_all(path, arm())
+    assert re.search(said, " | ".join(SOURCE.inspect(str(path)).problems))
 
 
 COUNTS = swap("message_count: 10\n", "message_count: 12\n")
