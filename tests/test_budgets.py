@@ -23,7 +23,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/loading": (1_278, 10_753, 6),
     "hma_data/registry": (1_268, 8_196, 6),
     "hma_data/shards": (2_497, 19_195, 11),
-    "hma_data/sources": (12_623, 104_188, 51),
+    "hma_data/sources": (12_625, 104_203, 51),
     "hma_data/storage": (1_697, 11_105, 11),
     "hma_data/tokenizers": (3_464, 25_269, 18),
     "hma_model": (564, 3_409, 4),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_689, 30_261, 20),
     "hma_model/worlds": (1_478, 11_069, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_594, 516_661
-TEST_LINES = 48_547
+PRODUCT_LINES, PRODUCT_NODES = 65_596, 516_676
+TEST_LINES = 48_559
 DOC_WORDS = 41_997
 
 

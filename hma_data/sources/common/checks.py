@@ -30,7 +30,9 @@ RARE = 0.05  # largest share of pauses among the intervals, for a rate without t
 REGULAR = 0.8  # least share of intervals within a third of the median, for counting lost frames
 STREAM = 0.5  # least such share for reporting pauses; below it, the topic carries events
 MAX_LOST_SHARE = 0.01  # share of lost frames above which they are reported
-UNITS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0))  # least time since 1970, seconds a unit
+# Times since 1970, of 2001 to 2103, and seconds a unit. Others may count from the start of a machine, in a
+# smaller unit; only nanoseconds have none.
+UNITS = ((1e17, 1e19, 1e-9), (1e15, 4.2e15, 1e-6), (1e12, 4.2e12, 1e-3), (1e9, 4.2e9, 1.0))
 NAMED_UNITS = {  # endings of keys -> seconds a unit
     "s": 1.0, "sec": 1.0, "secs": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3, "us": 1e-6, "usec": 1e-6,
     "ns": 1e-9, "nsec": 1e-9,
@@ -223,7 +225,7 @@ def skew(times: Floats, primary: Floats) -> tuple[float, float, float] | None:
 def seconds_a_unit(values: Array, key: str = "") -> float | None:
     """Return the length in seconds of one unit of a column of times; None where it is not clear.
 
-    The unit follows from the size of the times, from the ending of the key, or from their steps.
+    The unit follows from the ending of the key, from the size of the times, or from their steps.
 
     Args:
         values: (T,) as recorded.
@@ -234,12 +236,12 @@ def seconds_a_unit(values: Array, key: str = "") -> float | None:
     if len(times) < 3 or not np.isfinite(times).all() or steps.min() < 0 or not steps.max() > 0:
         return None
     step = float(np.median(steps))
-    unit = next((unit for least, unit in UNITS if times[0] >= least), None)
-    if unit is None and (named := TIMES.fullmatch(key.lower())):
-        unit = NAMED_UNITS.get(named[4])
-    if unit is None and not np.array_equal(times, np.round(times)):  # else frame numbers, or another unit
-        unit = 1.0
-    return unit if unit and STEPS_S[0] <= step * unit <= STEPS_S[1] else None
+    units = [unit for least, most, unit in UNITS if least <= times[0] < most]
+    if (named := TIMES.fullmatch(key.lower())) and named[4]:
+        units = [NAMED_UNITS[named[4]], *units]
+    if not units and not np.array_equal(times, np.round(times)):  # else frame numbers, or another unit
+        units = [1.0]
+    return next((unit for unit in units if STEPS_S[0] <= step * unit <= STEPS_S[1]), None)
 
 
 def is_times(key: str, shape: tuple[int, ...]) -> bool:

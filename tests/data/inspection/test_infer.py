@@ -21,6 +21,7 @@ from hma_data.errors import HMAError, SourceError, UsageError
 from hma_data.inspection.infer import from_inspection, infer
 from hma_data.registry.embodiment import Embodiment, find, problems
 from hma_data.sources.base import open_source
+from hma_data.sources.common.checks import seconds_a_unit
 from hma_data.sources.common.inspection import Inspection, KeyInfo, TopicInfo
 from hma_data.storage.yaml_io import parse_yaml
 from tests.command import ROOT, hma
@@ -398,6 +399,17 @@ def test_rates_of_attributes_and_of_times_in_any_unit(tmp_path, attributes, time
     values = inferred(path)
     assert (values["frequency_hz"] == hz) if hz else ("frequency_hz" in questions(values))
     first_clip(path, values)
+
+
+@pytest.mark.parametrize("hz", [5, 30, 1000])
+@pytest.mark.parametrize("since", [10, 3_600, 100_000])
+def test_times_since_a_machine_was_started_are_of_the_unit_that_their_key_names(since: int, hz: int) -> None:
+    seconds = since + np.arange(T) / hz
+    for key, unit in (("timestamp_ns", 1e-9), ("time_us", 1e-6), ("obs/time_ms", 1e-3)):
+        assert seconds_a_unit(np.rint(seconds / unit).astype(np.int64), key) == unit
+    assert (
+        seconds_a_unit(np.rint(seconds * 1e9).astype(np.int64), "timestamp") is None
+    )  # not of µs since 1973
 
 
 @pytest.mark.parametrize(
