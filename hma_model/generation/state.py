@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from hma_model.network.conditioning import ActionConditioning
-from hma_model.network.head import device_of
+from hma_model.network.draws import device_of
 from hma_model.network.network import Network
 from hma_model.network.trunks.contract import Carried, Conditioning, TimePositions, ring_times
 

@@ -17,7 +17,8 @@ from torch import Tensor
 
 from hma_data.errors import HMAError
 from hma_model.config import HMAConfig
-from hma_model.network.head import LatentReadout, RegressionReadout, TokenReadout, uniform
+from hma_model.network.draws import uniform
+from hma_model.network.head import LatentReadout, RegressionReadout, TokenReadout
 
 # The likeliest tokens leave out what is small and moves, because each of its places is unlikely: a pusher's
 # disc is gone after a frame. Draws by the trained frequencies scatter specks over the picture.

@@ -1,13 +1,11 @@
 """Read the trunk's features out as video tokens, patches of latents and action chunks.
 
-Every draw uses the given generator, on the generator's device, so that a run can be repeated exactly.
-
 B batch, T frames, S tokens of a frame, D width, F digits, V values of a digit, K = stride * action dim,
 M rows, C values of a sample, W width of the diffusion head.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache, partial
 from itertools import accumulate
 from operator import mul
@@ -20,6 +18,7 @@ from hma_model.config import ActionSpace, HMAConfig, Readout
 from hma_model.network.colors import chosen, color_distances
 from hma_model.network.copying import CopyGain, Copying, PatchCopy
 from hma_model.network.cross_entropy import cross_entropy, has_kernel
+from hma_model.network.draws import Generators, randn, uniform
 from hma_model.network.linear import Linear
 from hma_model.network.trunks.contract import rows_at
 
@@ -28,48 +27,6 @@ MOTION_SLOPE = 3.0  # a change of a third of a unit has most of the weight of mo
 _LEVEL_VALUES = 256  # sinusoids that describe a noise level
 TRAINING_LEVELS = 1000  # of noise
 CLIP = 10.0  # a step's estimate of the clean sample is clipped to ± this
-
-
-# Several draw equal parts of axis 0; a tensor holds numbers that were drawn before.
-type Generators = torch.Generator | Sequence[torch.Generator] | Tensor | None
-
-
-def uniform(shape: Sequence[int], generator: Generators, device: torch.device | str = "cpu") -> Tensor:
-    """Return float32 numbers in [0, 1), drawn on the generator's device and moved to `device`."""
-    return _draw(torch.rand, shape, generator, device)
-
-
-def randn(shape: Sequence[int], generator: Generators, device: torch.device | str) -> Tensor:
-    """Return standard normal float32 numbers, drawn on the generator's device and moved to `device`."""
-    return _draw(torch.randn, shape, generator, device)
-
-
-def _draw(
-    draw: Callable[..., Tensor], shape: Sequence[int], generator: Generators, device: torch.device | str
-) -> Tensor:
-    if isinstance(generator, Tensor):
-        return generator.view(tuple(shape))
-    if generator is None or isinstance(generator, torch.Generator):
-        return draw(tuple(shape), generator=generator, device=device_of(generator)).to(device)
-    part = (shape[0] // len(generator), *shape[1:])
-    return torch.cat([draw(part, generator=one, device=one.device) for one in generator]).to(device)
-
-
-def device_of(generator: torch.Generator | None) -> torch.device | str:
-    """Return the device on which a generator draws; without one, torch draws on the CPU."""
-    return "cpu" if generator is None else generator.device
-
-
-def nearby(generator: torch.Generator | None, device: torch.device) -> torch.Generator | None:
-    """Return a generator for many draws for a device: one of the device's own if the given one is another's.
-
-    Millions of numbers drawn on the CPU and moved would take a GPU longer than its passes.
-    """
-    if generator is None or generator.device.type == device.type:
-        return generator
-    seed = int(torch.randint(2**62, (), generator=generator, device=generator.device))
-    return torch.Generator(device).manual_seed(seed)
-
 
 # Chooses from the scores (B, f, k, V) of f digits, from the given one on, these digits (B, f, k).
 type Choose = Callable[[Tensor, int], Tensor]

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from hma_model.config import HMAConfig
-from hma_model.network.head import device_of, nearby, uniform
+from hma_model.network.draws import device_of, nearby, uniform
 from hma_model.network.stem import from_digits, to_digits
 
 HISTORY_FRAMES = 4  # of the shortest history that stays unmasked

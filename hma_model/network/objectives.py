@@ -16,7 +16,7 @@ from hma_data.errors import HMAError
 from hma_model.config import CROP_EDGE, OBJECTIVES, HMAConfig, Objective, Readout
 from hma_model.network.conditioning import Groups, align
 from hma_model.network.copying import frames_before
-from hma_model.network.head import randn, uniform
+from hma_model.network.draws import randn, uniform
 from hma_model.network.masking import (
     VideoMask,
     corrupt_tokens,

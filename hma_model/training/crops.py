@@ -17,7 +17,7 @@ from torch import Tensor
 
 from hma_data.loading.dataset import Batch
 from hma_model.config import HMAConfig
-from hma_model.network.head import uniform
+from hma_model.network.draws import uniform
 
 ANYWHERE = 0.15  # share of the windows whose square lies anywhere, so that what stands still is seen too
 

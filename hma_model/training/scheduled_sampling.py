@@ -16,7 +16,7 @@ from torch import Tensor
 from hma_data.loading.dataset import Batch
 from hma_model.network.conditioning import Groups, align
 from hma_model.network.copying import frames_before
-from hma_model.network.head import device_of, uniform
+from hma_model.network.draws import device_of, uniform
 from hma_model.network.model import HMA
 from hma_model.network.stem import from_digits, patches_before, split_tokens, unpatchify
 

@@ -18,7 +18,7 @@ from hma_model.generation.commands import Commands, described
 from hma_model.generation.passes import Passes
 from hma_model.generation.rollout import Rollout
 from hma_model.generation.unmask import Decoding
-from hma_model.network.head import randn
+from hma_model.network.draws import randn
 from hma_model.network.model import HMA
 from tests.model.network_parts import ARM, seeded, small_batch, small_config, small_model
 from tests.model.robots import make_model, save
