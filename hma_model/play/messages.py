@@ -9,9 +9,10 @@ A page sends JSON of at most MAX_MESSAGE_BYTES. The server sends JSON, and binar
 
 import json
 import struct
+from functools import partial
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from hma_data.errors import UsageError
 from hma_model.play.session import Frame
@@ -76,11 +77,11 @@ class SceneMessage(_Message):
 
 
 class SampleMessage(_Message):
-    """Change how frames are decoded."""
+    """Change how frames are decoded; every other field is one of `Decoding`."""
 
     do: Literal["sample"]
-    passes: int | None = Field(ge=1, le=16)  # None where the page shows none
-    temperature: float = Field(ge=0, le=2)
+    unmask_steps: int = Field(ge=1, le=16)
+    temperature: Annotated[float, Field(ge=0, le=2), AfterValidator(partial(round, ndigits=1))]
     order: Literal["random", "confidence"]
 
 

@@ -373,10 +373,7 @@ class Connection:
                         raise UsageError(
                             "order", f"this model has no {order!r}", f"known: {', '.join(known)}"
                         )
-                    warmth = round(message.temperature, 1)
-                    steps = message.passes or session.sampling.unmask_steps
-                    way = replace(session.sampling, unmask_steps=steps, temperature=warmth, order=order)
-                    session.sample(way)
+                    session.sample(replace(session.sampling, **message.model_dump(exclude={"do"})))
             self.tell(session.status())
         except HMAError as fault:
             self.tell({"kind": "error", "text": str(fault)})

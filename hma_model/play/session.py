@@ -249,14 +249,12 @@ class Session:
 
     def status(self) -> dict[str, Any]:
         """Return the settings that the page shows, as plain values."""
-        way = self.sampling
-        passes = None if self.world.one_pass else way.unmask_steps
-        sampling = {"passes": passes, "temperature": way.temperature, "order": way.order}
         return {
             "kind": "status", "paused": self.paused, "replays": self.replays, "fast": self.fast,
-            "sampling": sampling, "scene": self.number, "frame": self.count, "ended": self.ended,
-            "knows": bool(self._true), "parted": self.parted, "meter": self.metered,
-            "unmetered": self.unmetered, "metered": "" if self.meter is None else self.meter.verdict,
+            "sampling": vars(self.sampling), "one_pass": self.world.one_pass, "scene": self.number,
+            "frame": self.count, "ended": self.ended, "knows": bool(self._true), "parted": self.parted,
+            "meter": self.metered, "unmetered": self.unmetered,
+            "metered": "" if self.meter is None else self.meter.verdict,
         }  # fmt: skip
 
     def opened(self) -> dict[str, Any]:

@@ -235,7 +235,7 @@ WRONG = {
     "text": '{"do": "drive", "action": ["1", "2"], "input": 1}',
     "deep": "[" * 5000,
     "huge": '{"do": "resume", "session": "' + "x" * MAX_MESSAGE_BYTES + '"}',
-    "passes": '{"do": "sample", "passes": 1000000, "temperature": 0, "order": "random"}',
+    "passes": '{"do": "sample", "unmask_steps": 1000000, "temperature": 0, "order": "random"}',
     "scene": '{"do": "scene", "number": -1}',
 }
 
@@ -291,7 +291,7 @@ def test_wrong_values_are_told_and_the_session_goes_on(client: TestClient, stepp
         assert "there is no 'nobody'" in page.message("error")["text"]
         page.open()
         stepper.orders = ("random",)
-        page.send("sample", passes=2, temperature=0, order="confidence")
+        page.send("sample", unmask_steps=2, temperature=0, order="confidence")
         assert "no 'confidence' — known: random" in page.message("error")["text"]
         page.send("drive", action=[1, 2, 3], input=1)
         assert "has 3 values, this robot takes 2" in page.message("error")["text"]
