@@ -69,16 +69,16 @@ def _entry(path: Path, cache: "_Cache") -> RegistryEntry:
 
 
 def _judge(content: bytes, path: Path) -> dict[str, Any]:
-    from hma_data.registry.embodiment import Embodiment, find_problems
+    from hma_data.registry.embodiment import judged
 
     try:
         values = parse_yaml(decode_yaml(content, path), path.name)
     except HMAError as fault:
         return _unreadable(fault)
-    faults = find_problems(values)
+    robot, faults = judged(values)
     name = values.get("id") if isinstance(values, dict) else None
     return {
-        "facts": None if faults else facts(Embodiment.model_validate(values)),
+        "facts": None if robot is None else facts(robot),
         "problems": [asdict(fault) for fault in faults],
         "name": name if isinstance(name, str) else None,
     }

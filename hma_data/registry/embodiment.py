@@ -284,28 +284,28 @@ class Embodiment(SpecModel):
     @classmethod
     def from_values(cls, values: Any, where: str) -> "Embodiment":
         """Return the embodiment of a YAML's plain values; see `load`."""
-        found = problems(values)
-        if found and all(": still TODO" in problem for problem in found):
-            said = f"still to be answered: {', '.join(path for path, _ in todos(values))}"
-            raise RegistryError(where, said, "write answers in place of the TODOs in the file")
-        if found:
-            raise RegistryError(where, "; ".join(found), "hma registry schema prints what is allowed")
-        return cls.model_validate(values)
+        robot, found = judged(values)
+        if robot is None:
+            said, remedy = "; ".join(map(str, found)), "hma registry schema prints what is allowed"
+            if all(": still TODO" in str(problem) for problem in found):
+                said = f"still to be answered: {', '.join(path for path, _ in todos(values))}"
+                remedy = "write answers in place of the TODOs in the file"
+            raise RegistryError(where, said, remedy)
+        return robot
 
 
 def problems(values: Any) -> list[str]:
     """Return all problems of a YAML's plain values, one line each; empty when it is valid."""
-    return [str(problem) for problem in find_problems(values)]
+    return [str(problem) for problem in judged(values)[1]]
 
 
-def find_problems(values: Any) -> list[Problem]:
-    """Return all problems of a YAML's plain values."""
+def judged(values: Any) -> tuple[Embodiment | None, list[Problem]]:
+    """Return the embodiment of a YAML's plain values, or None and all problems."""
     if not isinstance(values, dict):
         said = {"NoneType": "is empty", "list": "is a list"}.get(type(values).__name__, "is a single value")
-        return [
-            Problem("", f"must be a mapping of keys to values, {said}", allowed=", ".join(_keys(Embodiment)))
-        ]
-    questions = todos(values)
+        said = f"must be a mapping of keys to values, {said}"
+        return None, [Problem("", said, allowed=", ".join(_keys(Embodiment)))]
+    robot, questions = None, todos(values)
     found = [Problem(path, f"still {TODO}: {text}") for path, text in questions]
     try:
         robot = Embodiment.model_validate(values)
@@ -317,7 +317,7 @@ def find_problems(values: Any) -> list[Problem]:
             follows = item["type"] == "too_short" and item["input"]  # pydantic leaves out the wrong items
             if path not in asked and not follows:
                 found.append(_problem(path, item, values))
-    return list(dict.fromkeys(found))
+    return None if found else robot, list(dict.fromkeys(found))
 
 
 def _rate_problem(robot: Embodiment) -> list[Problem]:
