@@ -111,16 +111,10 @@ def inspect_recording(
         found += unanswered(inspection, lack, held, offsets)
     report["findings"] = [finding.to_json() for finding in found]
     report["problems"] = [str(finding) for finding in found if finding.severity != "info"]
-    report["checks"] = _results(inspection.checks, found)
+    report["checks"] = dict.fromkeys(CHECKS, NOT_CHECKED) | dict.fromkeys(inspection.checks, "ok")
+    for finding in sorted(found, key=lambda one: SEVERITIES.index(one.severity)):  # the worst one stays
+        report["checks"][finding.check] = finding.severity
     return report
-
-
-def _results(made: Iterable[str], found: Iterable[Finding]) -> dict[str, str]:
-    """Return the result of each check: ok, the worst severity found, or "not checked" where impossible."""
-    told = dict.fromkeys(CHECKS, NOT_CHECKED) | dict.fromkeys(made, "ok")
-    for finding in sorted(found, key=lambda one: SEVERITIES.index(one.severity)):
-        told[finding.check] = finding.severity
-    return told
 
 
 def _fit(
@@ -302,19 +296,15 @@ def _recording(uri: str, robot: Embodiment | None, sample: int) -> Iterator[Find
     if not inspection.episodes:
         yield NO_EPISODES
     elif robot is None:
-        yield from _without_robot(inspection)
+        cameras = {info.key for info in inspection.keys if len(info.shape) == 3}
+        blank = {finding.key for finding in inspection.findings if finding.check == "blank"}
+        for finding in inspection.findings:  # a blank camera warns where no other is there to be used
+            warns = finding.check == "blank" and cameras <= blank
+            yield replace(finding, severity="warn") if warns else finding
         yield from unanswered(inspection, *proposal(inspection))
     else:
         yield from _for_robot(inspection, robot)
         yield from _episodes(uri, robot, source, sample, inspection)
-
-
-def _without_robot(inspection: Inspection) -> Iterator[Finding]:
-    """Yield the findings; blank frames are a warning where no other camera is there to be used."""
-    cameras = {info.key for info in inspection.keys if len(info.shape) == 3}
-    blank = {finding.key for finding in inspection.findings if finding.check == "blank"}
-    for finding in inspection.findings:
-        yield replace(finding, severity="warn") if finding.check == "blank" and cameras <= blank else finding
 
 
 def _answered(finding: Finding, robot: Embodiment) -> bool:

@@ -102,19 +102,16 @@ class WindowIndex:
     @cached_property
     def unit_first(self) -> Ints:
         """Return (G+1,) windows before the row groups; group g starts unit_first[g] to unit_first[g+1]."""
-        return self._windows_before(self.edges)
+        if not len(self._starts):
+            return np.zeros(len(self.edges), np.int64)
+        at = np.searchsorted(self._starts, self.edges, side="right") - 1
+        inside = np.minimum(self.edges - self._starts[at], np.diff(self._before)[at])
+        return np.where(at < 0, 0, self._before[at] + inside)
 
     @cached_property
     def offsets(self) -> Ints:
         """Return the rows (T,) of a window's frames after its first row."""
         return np.arange(0, self.span, self.row_stride)
-
-    def _windows_before(self, rows: Ints) -> Ints:
-        if not len(self._starts):
-            return np.zeros(len(rows), np.int64)
-        at = np.searchsorted(self._starts, rows, side="right") - 1
-        inside = np.minimum(rows - self._starts[at], np.diff(self._before)[at])
-        return np.where(at < 0, 0, self._before[at] + inside)
 
     def _piece(self, windows: Ints) -> Ints:
         return np.searchsorted(self._before, windows, side="right") - 1

@@ -103,7 +103,10 @@ class NetworkTokenizer:
     @torch.inference_mode()
     def _encode_batch(self, frames: Images) -> Array:
         """Encode at most one batch of frames; check that the spec's dtype can store the result."""
-        pixels = self._padded(frames).permute(0, 3, 1, 2).float().mul_(2 / 255).sub_(1)
+        whole = frames  # repeated up to a whole batch
+        if len(frames) < self.batch:
+            whole = np.resize(frames, (self.batch, *frames.shape[1:]))
+        pixels = self._moved(whole).permute(0, 3, 1, 2).float().mul_(2 / 255).sub_(1)
         pixels = pixels.to(self.dtype).contiguous(memory_format=self._format)
         made, spec = self._encode(pixels)[: len(frames)].cpu(), self.spec
         if spec.kind == "discrete":
@@ -141,12 +144,6 @@ class NetworkTokenizer:
         values = tokens.astype(np.int64 if self.spec.kind == "discrete" else np.float32)
         made: Images = self.pictures(self._moved(values)).cpu().numpy()
         return made
-
-    def _padded(self, part: Array) -> Tensor:
-        """Return the part on the device, repeated up to a whole batch."""
-        if len(part) < self.batch:
-            part = np.resize(part, (self.batch, *part.shape[1:]))
-        return self._moved(part)
 
     def _moved(self, part: Array) -> Tensor:
         return torch.from_numpy(part.copy()).to(self.device)  # torch takes no negative strides

@@ -358,7 +358,8 @@ class VideoDecoder:
         """
         packets: Iterator[bytes] | None = None
         for index in indices:
-            if index not in self._ready and self._must_begin(index):
+            skips = self._keyframes[self._next + 1 : index + 1].any()
+            if index not in self._ready and (self._context is None or index <= self._taken or skips):
                 self._begin(index)
                 packets = None
             while index not in self._ready:
@@ -373,10 +374,6 @@ class VideoDecoder:
                 fault = f"frame {index} of the video is damaged, or depends on one that is damaged or lost"
                 raise EpisodeError(self._where, fault)
             yield self._to_rgb(frame)
-
-    def _must_begin(self, index: int) -> bool:
-        skips = bool(self._keyframes[self._next + 1 : index + 1].any())
-        return self._context is None or index <= self._taken or skips
 
     def _begin(self, index: int) -> None:
         import av

@@ -116,6 +116,10 @@ def measure(times: Floats) -> StreamTimes:
     period = float(np.median(steps)) if len(steps) else 0.0
     regular = float(np.mean(np.abs(steps / period - 1) < 1 / 3)) if period > 0 else 0.0
     worst = int(np.argmax(steps)) if len(steps) else 0
+    lost = None
+    if regular >= REGULAR and len(steps) >= 8:
+        # intervals that are multiples of the median one, without pauses; a late frame is not a lost one
+        lost = max(int(np.sum(np.rint(_usual(steps, period) / period) - 1)), 0)
     return StreamTimes(
         count=len(times),
         hz=hz,
@@ -126,7 +130,7 @@ def measure(times: Floats) -> StreamTimes:
         gap_at_s=float(times[worst] - times.min()) if len(steps) else 0.0,
         period_s=period,
         regular=regular,
-        lost=_lost(steps, period) if regular >= REGULAR and len(steps) >= 8 else None,
+        lost=lost,
         infinite=int(np.sum(~finite)),
     )
 
@@ -158,12 +162,6 @@ def _usual(steps: Floats, period: float) -> Floats:
 def pause_s(period: float) -> float:
     """Return the seconds beyond which an interval is a pause, given the median one."""
     return max(PAUSE * period, PAUSE_S)
-
-
-def _lost(steps: Floats, period: float) -> int:
-    """Count lost frames from the intervals that are multiples of the median one; leave out pauses."""
-    usual = _usual(steps, period)
-    return max(int(np.sum(np.rint(usual / period) - 1)), 0)  # a late frame is not a lost one
 
 
 def time_findings(key: str, times: StreamTimes, camera: bool = False, episode: str = "") -> Iterator[Finding]:

@@ -244,7 +244,10 @@ class Metadata:
 
     def video(self, index: int, key: str) -> Span:
         """Return the part of a video that holds an episode's frames of one camera."""
-        row, path = self.episodes[index], self._video_path(index, key)
+        if not self.info.video_path:
+            raise SourceError(self._where, "names no video_path", "add it, as lerobot does")
+        path = self._filled(self.info.video_path, index, f"videos/{key}", {"video_key": key})
+        row = self.episodes[index]
         if not self._is_v3:
             return Span(index, path, row["length"])
         start, stop = row.get(f"videos/{key}/from_timestamp"), row.get(f"videos/{key}/to_timestamp")
@@ -264,11 +267,6 @@ class Metadata:
                 name: tuple(sorted(spans, key=lambda span: span.start)) for name, spans in found.items()
             }
         return self._spans[key][path]
-
-    def _video_path(self, index: int, key: str) -> str:
-        if not self.info.video_path:
-            raise SourceError(self._where, "names no video_path", "add it, as lerobot does")
-        return self._filled(self.info.video_path, index, f"videos/{key}", {"video_key": key})
 
     def _filled(self, template: str, index: int, prefix: str, values: dict[str, Any]) -> str:
         """Fill a path template of info.json with the episode's numbers."""

@@ -257,13 +257,11 @@ class StillImages(OneByOne):
         if isinstance(value, dict):
             value = value.get("bytes") or value.get("path")
         if isinstance(value, str):
-            return self._file(value, self._where(index))
+            try:
+                return self._folder.path(value).read_bytes()
+            except OSError as fault:
+                said = f"its image {value!r} cannot be read: {fault.strerror}"
+                raise EpisodeError(self._where(index), said) from fault
         if not isinstance(value, bytes):
             raise EpisodeError(self._where(index), "holds no image")
         return value
-
-    def _file(self, relative: str, where: str) -> bytes:
-        try:
-            return self._folder.path(relative).read_bytes()
-        except OSError as fault:
-            raise EpisodeError(where, f"its image {relative!r} cannot be read: {fault.strerror}") from fault

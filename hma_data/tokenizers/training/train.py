@@ -319,8 +319,13 @@ def train(
     torch.set_flush_denormal(True)
     errors: list[float] = []
     last = time.monotonic()
+    draw = partial(run.batch, count=recipe.training.batch)
+    steps = range(run.step, recipe.training.steps)
+    drawn: Iterator[Tensor] = map(draw, steps)
+    if workers:  # threads draw ahead
+        drawn = (crops for _, crops in in_order(draw, steps, workers))
     try:
-        for crops in _crops(run, workers):
+        for crops in drawn:
             errors.append(run.advance(crops))
             now = time.monotonic()
             run.seconds, last = run.seconds + now - last, now
@@ -346,10 +351,3 @@ def _finished(out: Path, facts: dict[str, Any], steps: int) -> dict[str, Any] | 
         return None
     asked = {key: facts[key] for key in ("recipe_sha256", "corpus_sha256", "seed")} | {"steps": steps}
     return told if asked.items() <= told.items() else None
-
-
-def _crops(run: TokenizerTraining, workers: int) -> Iterator[Tensor]:
-    """Yield the crops of every remaining step, in order; threads draw them ahead."""
-    draw = partial(run.batch, count=run.recipe.training.batch)
-    steps = range(run.step, run.recipe.training.steps)
-    return (crops for _, crops in in_order(draw, steps, workers)) if workers else map(draw, steps)
