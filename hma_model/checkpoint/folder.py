@@ -166,6 +166,11 @@ class Checkpoint:
         home = self.folder / "embodiments" / embodiment
         return [name for name in PICTURES if (home / name).is_file()]
 
+    def files(self, embodiment: str) -> dict[str, Path]:
+        """Return the files of an embodiment by name, the pictures first and the card last."""
+        parts = (*self.pictures(embodiment), *PARTS)
+        return {f"embodiments/{embodiment}/{part}": self.path(embodiment, part) for part in parts}
+
     def embodiment(self, embodiment: str) -> Embodiment:
         """Return the embodiment as it was at training."""
         return Embodiment.load(self.path(embodiment, YAML))

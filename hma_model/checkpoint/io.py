@@ -90,11 +90,11 @@ def save(
         with new_folder(folder) as new:
             if base:
                 trunk = base.trunk_sha256
-                taken = [CONFIG, TRUNK]
+                taken = {name: inside(base.folder, name) for name in (CONFIG, TRUNK)}
                 for name in set(base.embodiments) - set(embodiment_yaml):
-                    taken += [f"embodiments/{name}/{part}" for part in (*PARTS, *base.pictures(name))]
-                for name in taken:
-                    _link(inside(base.folder, name), new / name)
+                    taken |= base.files(name)
+                for name, path in taken.items():
+                    _link(path, new / name)
             else:
                 write_tensors(new / TRUNK, model.trunk_state(), {"format": "pt"}, half)
                 trunk = file_sha256(new / TRUNK)

@@ -56,7 +56,7 @@ def push(
 
     if space and not page:
         raise UsageError("--space", "needs the page that it shows", "add --page")
-    opened = Checkpoint.open(checkpoint, embodiment)
+    opened, named = Checkpoint.open(checkpoint, embodiment), target.rstrip("/").rsplit("/", 1)[-1]
     static = Space(space, private) if space else None
     if film or sample:
         _add_films(opened, sample, embodiment)
@@ -64,7 +64,7 @@ def push(
         exported = None
         if page:
             exported = Path(folder) / "page"
-            export_checkpoint(opened.name, [], exported, embodiment, target.rstrip("/").rsplit("/", 1)[-1])
+            export_checkpoint(opened.name, [], exported, embodiment, named)
         address = hub.push(opened, target, embodiment, private, exported)
         say(f"published to {address}")
         if static and exported:
@@ -75,12 +75,7 @@ def push(
         if value_of(judged, "follows") is False:
             say(f"{name} {_cell(value_of(judged, 'verdict'), 400)}; the model card starts with this verdict")
     robots = "".join(f" -e {shlex.quote(name)}" for name in embodiment or ())
-    say(f"fetch it: hma hub pull {shlex.quote(target)}{robots} --out {_folder_for(target)}")
-
-
-def _folder_for(target: str) -> str:
-    """Return a folder to pull to, named as the published checkpoint."""
-    return shlex.quote(f"{target.rstrip('/').rsplit('/', 1)[-1]}-pulled")
+    say(f"fetch it: hma hub pull {shlex.quote(target)}{robots} --out {shlex.quote(named + '-pulled')}")
 
 
 def _add_films(checkpoint: "Checkpoint", sample: list[Path] | None, embodiments: list[str] | None) -> None:

@@ -173,17 +173,12 @@ class Moments:
 
 def frechet_distance(one: Moments, other: Moments) -> float:
     """Return |m1 - m2|² + tr(C1 + C2 - 2 (C1 C2)^½) of two normal distributions."""
-    root = _root(one.covariance)
+    values, vectors = np.linalg.eigh(one.covariance)
+    root = (vectors * np.sqrt(values.clip(min=0))) @ vectors.T
     product = np.linalg.eigvalsh(root @ other.covariance @ root)
     apart = np.square(one.mean - other.mean).sum()
     traces = np.trace(one.covariance) + np.trace(other.covariance)
     return max(float(apart + traces - 2 * np.sqrt(product.clip(min=0)).sum()), 0.0)
-
-
-def _root(matrix: Floats) -> Floats:
-    """Return the square root of a symmetric matrix without negative eigenvalues."""
-    values, vectors = np.linalg.eigh(matrix)
-    return (vectors * np.sqrt(values.clip(min=0))) @ vectors.T
 
 
 # -- the judge

@@ -219,7 +219,8 @@ class StepGraph(nn.Module):
         self, frame: Tensor, conditioning: Conditioning, times: TimePositions, past: Carried, draws: Any
     ) -> tuple[Tensor, Tensor]:
         """Return the next frame's tokens (h, w) int32, and their mean entropy (1,) as of `Rollout`."""
-        before = self._digits(self._ids(frame))
+        squares = patchify(self._ids(frame)[None, None], self.config.merge)
+        before = to_digits(squares, self.config.factored).flatten(2)  # of a square of tokens side by side
         digits, nats = torch.zeros_like(before), torch.zeros(1)
         shown = torch.zeros(before.shape[:2], dtype=torch.bool)
         uniform = draws["noise"].clamp(1e-20, 1 - 2**-24)
@@ -248,23 +249,15 @@ class StepGraph(nn.Module):
             digits = _put(digits, places, made.transpose(1, 2))
             likely = torch.cat([_widened(scores, values) for scores in unsure], dim=1).softmax(-1)
             nats = nats - (likely * likely.clamp_min(1e-30).log()).sum((1, 2, 3))
-        return self._stored(digits), nats / digits.shape[1]
+        apart = digits.unflatten(-1, (-1, len(self.config.factored)))
+        ids = from_digits(apart, self.config.factored)[0]
+        tokens = unpatchify(ids, self.config.merge, self.config.token_grid)[0]
+        return tokens.int(), nats / digits.shape[1]
 
     def _ids(self, stored: Tensor) -> Tensor:
         """Return tokens int32 as int64 ids; those from 2³¹ on have become negative."""
         ids = stored.long()
         return ids % 2**32 if self.config.vocab_size > 2**31 else ids
-
-    def _digits(self, frame: Tensor) -> Tensor:
-        """Return the digits (1, S, F) of tokens (h, w), those of a square of tokens side by side."""
-        squares = patchify(frame[None, None], self.config.merge)
-        return to_digits(squares, self.config.factored).flatten(2)
-
-    def _stored(self, digits: Tensor) -> Tensor:
-        """Return the tokens (h, w) int32 of digits (1, S, F)."""
-        config = self.config
-        ids = from_digits(digits.unflatten(-1, (-1, len(config.factored))), config.factored)
-        return unpatchify(ids[0], config.merge, config.token_grid)[0].int()
 
     # -- patches of latents
 

@@ -28,7 +28,6 @@ from hma_model.checkpoint.folder import (
     TRUNK,
     Checkpoint,
     check_id,
-    inside,
     parse_config,
 )  # fmt: skip
 from hma_model.checkpoint.model_card import JUDGED, render
@@ -162,9 +161,9 @@ def _changes(
         if foreign and (store.repo is None or MANIFEST in foreign):
             named = "a shard set" if MANIFEST in foreign else f"something else: {foreign[0]}"
             raise HubError(store.name, f"holds {named}", "push to another address")
-        changes[CONFIG] = inside(source.folder, CONFIG)
+        changes[CONFIG] = source.folder / CONFIG
     if TRUNK not in files:
-        changes[TRUNK] = inside(source.folder, TRUNK)
+        changes[TRUNK] = source.folder / TRUNK
     if not {CONFIG, ENV} <= files.keys():
         changes[ENV] = ENV_CODE.format(repo=store.repo).encode()
     if page is not None:
@@ -172,13 +171,9 @@ def _changes(
         parts = [path for path in page.rglob("*") if path.is_file()]
         changes |= {f"{PAGE}{path.relative_to(page).as_posix()}": path for path in parts}
     for name in ids:
-        shown = source.pictures(name)
-        for part in (*shown, *PARTS):
-            changes[f"embodiments/{name}/{part}"] = source.path(name, part)
-        for part in PICTURES:  # a picture that is there shows what earlier weights did
-            path = f"embodiments/{name}/{part}"
-            if part not in shown and path in files:
-                changes[path] = None
+        # A picture that is there shows what earlier weights did.
+        changes |= {path: None for part in PICTURES if (path := f"embodiments/{name}/{part}") in files}
+        changes |= source.files(name)
     others = {name: f"embodiments/{name}/{CARD}" for name in embodiment_ids(files) if name not in ids}
     store.warm(list(others.values()))
     cards = source.cards(ids)

@@ -80,9 +80,16 @@ def write_report(out: StrPath) -> None:
         _headline(page, recipe, recent, evaluations, figures)
         _robots(page, recent, evaluations, figures)
         _curves(page, out, recipe, evaluations, figures)
-    _samples(page, out)
+    sheets = newest_sheets(out)
+    if sheets:
+        page.section("Predictions on held-out windows")
+    for name, path in sheets.items():
+        page.picture(path.read_bytes(), "png", f"{name}, after step {int(path.stem[5:13]):,}")
     if recent:
-        _course(page, figures)
+        page.section("Course")
+        rates = figures.points("rates/")
+        for key, (label, log) in RATES.items():
+            page.picture(course(rates.get(key, ()), label, log), "svg+xml", f"{label} over the run")
     for title, columns, values in (
         ("Recipe", ["key", "value"], sorted(recipe.items())),
         ("Environment", ["what", "is"], ground.items()),
@@ -135,21 +142,6 @@ def _curves(page: Page, out: Path, recipe: dict[str, Any], evaluations: list[Lin
     page.section("Losses")
     plot = loss_curves(figures.points("training/loss/"), figures.points("held_out/loss/"), label)
     page.picture(plot, "svg+xml", "Training (lines) and held-out (markers) loss by robot")
-
-
-def _samples(page: Page, out: Path) -> None:
-    newest = newest_sheets(out)
-    if newest:
-        page.section("Predictions on held-out windows")
-    for name, path in newest.items():
-        page.picture(path.read_bytes(), "png", f"{name}, after step {int(path.stem[5:13]):,}")
-
-
-def _course(page: Page, figures: Figures) -> None:
-    page.section("Course")
-    rates = figures.points("rates/")
-    for key, (label, log) in RATES.items():
-        page.picture(course(rates.get(key, ()), label, log), "svg+xml", f"{label} over the run")
 
 
 def _mean(values: list[Any]) -> float:

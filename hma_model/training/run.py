@@ -299,8 +299,11 @@ class Run:
             with self._autocast():
                 # not compiled: each number of windows would be compiled anew
                 with torch.compiler.set_stance("force_eager") if recipe.compile else nullcontext():
-                    batch = self._cropped(number, batch)
-                    batch = self._with_own_past(number, batch)
+                    if self.model.config.crop and self.done < recipe.whole_from:
+                        batch = cropped(self.model.config, batch, self._generator("crops", number))
+                    if recipe.self_forward and self.step >= recipe.self_forward_from:  # its own past
+                        own = recipe.self_forward, recipe.self_forward_frames
+                        batch = forwarded(self.model, batch, *own, self._generator("self_forward", number))
                 output = self.parallel_model(batch, generator=generator)
             if not output.loss.requires_grad:
                 fault = f"leaves nothing to train with the objective {output.objective}"
@@ -310,20 +313,6 @@ class Run:
 
     def _generator(self, what: str, number: int) -> torch.Generator:
         return torch.Generator().manual_seed(seed_for(self.recipe.seed, what, self.step, number))
-
-    def _cropped(self, number: int, batch: Batch) -> Batch:
-        """Return the batch, cut to squares if the model is still trained on parts of frames."""
-        if not self.model.config.crop or self.done >= self.recipe.whole_from:
-            return batch
-        return cropped(self.model.config, batch, self._generator("crops", number))
-
-    def _with_own_past(self, number: int, batch: Batch) -> Batch:
-        """Return the batch, in which the past of some windows is the model's own, as the recipe has it."""
-        recipe = self.recipe
-        if not recipe.self_forward or self.step < recipe.self_forward_from:
-            return batch
-        draws = self._generator("self_forward", number)
-        return forwarded(self.model, batch, recipe.self_forward, recipe.self_forward_frames, draws)
 
     def _autocast(self) -> AbstractContextManager[Any]:
         if self.recipe.precision == "fp32":
