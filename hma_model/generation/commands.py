@@ -142,7 +142,10 @@ def warn_outside(
     watched = vars(model).setdefault("watched_commands", {})
     names = [embodiments] * len(actions) if isinstance(embodiments, str) else list(embodiments)
     for name in sorted(set(names)):
-        own = watched[name] if name in watched else _known(model, name)
+        own = watched.get(name)
+        if name not in watched:
+            with suppress(CheckpointError):  # the checkpoint that tells them may no longer be there
+                own = Commands.of(model, name)
         if own is not None:
             mine = [row for row, one in enumerate(names) if one == name]
             rows = actions[mine, :, : own.stride * len(own.names)].numpy(force=True)
@@ -150,13 +153,6 @@ def warn_outside(
             watched[name] = None if said else own
             if said:
                 warnings.warn(f"{said}. Shown only once", OutsideRangeWarning, stacklevel=4)
-
-
-def _known(model: Network, embodiment: str) -> Commands | None:
-    """Return the commands of an embodiment; None if the checkpoint that tells them is no longer there."""
-    with suppress(CheckpointError):
-        return Commands.of(model, embodiment)
-    return None
 
 
 def described(model: Network, embodiment: str) -> Embodiment | None:
