@@ -4,8 +4,11 @@ N pictures, H×W pixels; uint8 RGB everywhere. Only this module resizes pictures
 tokenizer's spec because it changes the tokens.
 """
 
+import math
 import os
 import re
+import threading
+from functools import cache, lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -19,6 +22,7 @@ from hma_data.registry.components import Camera, Quality
 Filter = Literal["area", "linear", "antialias"]
 _REDUCED = ((8, 64), (4, 32), (2, 16))  # share of a JPEG's sides, and the flag of cv2.IMREAD_REDUCED_*
 TIFF, TIFF_BITS, TIFF_CHANNELS = (b"II*\0", b"MM\0*"), 258, 277  # first bytes; tags
+LEAST_SUM = 2000  # pixels of one call; with fewer, INTER_AREA is as fast as sums
 BATCH = 16  # pictures that `antialias` resizes in one call
 MAX_PIXELS = 64_000_000  # a picture that claims more is a decompression bomb or an error
 FINE_BLOCKS, COARSE_BLOCKS = (16, 16), (8, 8)  # blocks
@@ -32,8 +36,10 @@ TO_SDR = (
     "zscale=t=bt709:m=bt709:r=tv,format=yuv420p -fps_mode passthrough OUT"
 )
 LIMITED, FULL = 1, 2  # FFmpeg's AVCOL_RANGE: luma of 16 to 235, or of 0 to 255
+_memory = threading.local()  # use -> array that `_held` keeps
 
 
+@cache
 def opencv() -> Any:
     """Import and return the cv2 module."""
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))  # OpenCV reads it when it is loaded
@@ -257,7 +263,11 @@ def resize(
         return out
     shrinks = inner_h < height or inner_w < width
     interpolation = cv2.INTER_AREA if resize_filter == "area" and shrinks else cv2.INTER_LINEAR
+    by_sums = interpolation == cv2.INTER_AREA and _takes_sums(height, width, inner_h, inner_w)
     for frame, square in zip(frames, inner):
+        if by_sums:
+            _resize_by_sums(frame, square)
+            continue
         # OpenCV takes gaps between rows, but not between pixels or backwards.
         rows, *pixel = frame.strides
         if rows <= 0 or pixel != [3, 1]:
@@ -270,6 +280,71 @@ def _middle(frames: Images, height: int, width: int) -> Images:
     """Return the middle (N, height, width, 3) of pictures, a view."""
     top, left = (frames.shape[1] - height) // 2, (frames.shape[2] - width) // 2
     return frames[:, top : top + height, left : left + width]
+
+
+@lru_cache(maxsize=64)
+def _shares(inputs: int, outputs: int) -> tuple[int, list[list[tuple[int, int]]]]:
+    """Return p, and for each of q outputs the (index, weight) of the inputs that it covers, of p.
+
+    p/q is inputs/outputs in lowest terms. Weights are q-ths of an input, so those of an output add up to p.
+    """
+    p, q = (count // math.gcd(inputs, outputs) for count in (inputs, outputs))
+    shares = []
+    for start in range(0, p * q, p):
+        covered = range(start // q, -(-(start + p) // q))
+        shares.append([(i, min(start + p, (i + 1) * q) - max(start, i * q)) for i in covered])
+    return p, shares
+
+
+def _takes_sums(height: int, width: int, inner_h: int, inner_w: int) -> bool:
+    """Check whether `_resize_by_sums` surely makes the bytes of INTER_AREA, and is faster.
+
+    INTER_AREA adds float32. On an axis where an output covers n inputs, it rounds n + 1 times. A mean is an
+    integer over p·p' of the two axes: if both are odd, it is 1/(2·p·p') or more away from half a level.
+    """
+    (p, down), (other, across) = _shares(height, inner_h), _shares(width, inner_w)
+    longest, total = max(p, other), p * other
+    shrinks = p > len(down) > 1 and other > len(across) > 1
+    if not shrinks or not total % 2 or 255 * longest >= 2**16 or height * width < LEAST_SUM * longest:
+        return False
+    roundings = max(map(len, down)) + max(map(len, across)) + 2
+    return 255 * roundings * 2.0**-24 < 1 / (2 * total)
+
+
+def _resize_by_sums(frame: Images, square: Images) -> None:
+    """Resize a picture (H, W, 3) into (h, w, 3) by exact means, in a third of the time of INTER_AREA."""
+    cv2, (height, width) = opencv(), square.shape[:2]
+    total = _shares(len(frame), height)[0] * _shares(frame.shape[1], width)[0]
+    whole = _held("whole", frame.shape, np.uint16)
+    np.copyto(whole, frame)
+    columns = _held("columns", (frame.shape[1], height, 3), np.uint16)
+    cv2.transpose(_weighted_sums(whole, height, "rows"), dst=columns)
+    if 255 * total >= 2**16:
+        columns = columns.astype(np.float32)
+    means = _held("means", (width, height, 3), np.uint8)
+    cv2.convertScaleAbs(_weighted_sums(columns, width, "sums"), dst=means, alpha=1 / total)
+    cv2.transpose(means, dst=square)
+
+
+def _weighted_sums(lines: NDArray[Any], outputs: int, use: str) -> NDArray[Any]:
+    """Return the weighted sums (outputs, W, 3) of the lines (H, W, 3) that each output covers, in `_held`."""
+    cv2, (p, shares) = opencv(), _shares(len(lines), outputs)
+    groups = lines.reshape(len(lines) // p, p, -1)
+    sums = _held(use, (len(groups), len(shares), groups.shape[2]), lines.dtype)
+    for i, ((first, weight), (second, other), *more) in enumerate(shares):
+        cv2.addWeighted(groups[:, first], weight, groups[:, second], other, 0, dst=sums[:, i])
+        for j, further in more:
+            cv2.addWeighted(groups[:, j], further, sums[:, i], 1, 0, dst=sums[:, i])
+    return sums.reshape(outputs, *lines.shape[1:])
+
+
+def _held(use: str, shape: tuple[int, ...], kind: Any) -> NDArray[Any]:
+    """Return memory of this thread for that use: to get it anew for each picture may cost more than sums."""
+    held = vars(_memory)
+    if use not in held or (held[use].shape, held[use].dtype) != (shape, kind):
+        held[use] = np.empty(shape, kind)
+    found: NDArray[Any] = held[use]
+    return found
 
 
 def _resize_antialiased(frames: Images, out: Images) -> None:

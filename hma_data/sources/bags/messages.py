@@ -147,10 +147,16 @@ def field_names(message: Any) -> list[str]:
     if isinstance(message, dict):
         return list(message)
     if dataclasses.is_dataclass(message):
-        return [item.name for item in dataclasses.fields(message) if item.default is dataclasses.MISSING]
+        kind: Any = type(message)
+        return list(_ros_fields(kind))
     if hasattr(message, "DESCRIPTOR"):
         return [item.name for item in message.DESCRIPTOR.fields if not _is_left_out(message, item)]
     return []
+
+
+@lru_cache(maxsize=256)
+def _ros_fields(kind: Any) -> list[str]:
+    return [item.name for item in dataclasses.fields(kind) if item.default is dataclasses.MISSING]
 
 
 def _is_left_out(message: Any, field: Any) -> bool:
@@ -208,10 +214,11 @@ def value_names(owners: Sequence[Any], width: int) -> tuple[str, ...]:
     """
     for owner in owners:
         if is_message_list(owner):
-            lists = [child_of_each(owner, name) for name in ELEMENT_NAMES]
+            lists = (child_of_each(owner, name) for name in ELEMENT_NAMES)
         else:
-            fields = [*NAMES_FIRST, *(name for name in field_names(owner) if name not in NAMES_FIRST)]
-            lists = [child(owner, name) for name in fields if name in field_names(owner)]
+            known = field_names(owner)
+            first = [name for name in NAMES_FIRST if name in known]
+            lists = (child(owner, name) for name in dict.fromkeys([*first, *known]))
         for names in lists:
             if not is_list(names) or len(names) != width:
                 continue
