@@ -20,7 +20,7 @@ from scipy.special import betaincinv
 
 from hma_data.arrays import Bools, Floats, Ints
 
-RESAMPLES = 2000
+RESAMPLES, BATCHES = 2000, 20  # a batch of ranks of single episodes fits in memory
 MIN_POLICIES, MIN_EPISODES = 3, 8  # fewer say nothing about a correlation
 FEW_POLICIES = 5  # fewer are drawn as the same few again and again: the interval would say nothing
 TAIL = 0.025  # chance beyond either end of an interval
@@ -149,14 +149,14 @@ def _mirrored(value: Floats, spread: Floats, least: float, most: float) -> Estim
     return Estimate(middle, max(below, least), min(above, most))
 
 
-def _ends(spread: Floats, least: float, most: float) -> tuple[float, float]:
+def _ends(spread: Floats, least: float, most: float, tail: float = TAIL) -> tuple[float, float]:
     """Return the interval of resampled figures (R,), which are NaN where there is nothing to compare.
 
     Such a resample has all policies or outcomes alike. Dropping it would keep those in which one lucky
     episode parts them, so it widens the interval to both sides instead.
     """
-    low = np.percentile(np.where(np.isnan(spread), least, spread), 100 * TAIL)
-    high = np.percentile(np.where(np.isnan(spread), most, spread), 100 * (1 - TAIL))
+    low = np.percentile(np.where(np.isnan(spread), least, spread), 100 * tail)
+    high = np.percentile(np.where(np.isnan(spread), most, spread), 100 * (1 - tail))
     return float(low), float(high)
 
 
@@ -330,30 +330,30 @@ def auroc(true: Bools, scores: Floats, seed: int = 0) -> Estimate:
 
 
 def episode_correlation(one: Floats, other: Floats, seed: int = 0) -> Estimate:
-    """Return how the scores (M, N) of single episodes correlate.
+    """Return how the ranks of the scores (M, N) of single episodes correlate (Spearman).
 
-    The interval is Fisher's, with Student's t and the spread of resamples, which draw scenes jointly for all
-    policies. It is never narrower than that of independent episodes.
+    Pearson's correlation would hang on the few episodes in which the model loses an object. A resample draws
+    scenes, jointly for all policies. Those of few scenes vary too little, so the percentiles are farther out,
+    by Student's t (Hesterberg 2015, 4.3).
     """
     count = one.shape[1]
     if count < MIN_EPISODES:
         return Estimate(None, reason=f"{count} of at least {MIN_EPISODES} episodes")
     if np.ptp(one) < 1e-12 or np.ptp(other) < 1e-12:
         return Estimate(None, reason="all episodes have the same score")
-    value = float(pearson(one.ravel(), other.ravel()))
-    x, y = one - one.mean(), other - other.mean()
-    drawn = _drawn_episodes(count, seed) / one.size
-    xx, yy, xy, mean_x, mean_y = (drawn @ part.sum(axis=0) for part in (x * x, y * y, x * y, x, y))
-    spread = (xx - mean_x**2) * (yy - mean_y**2)
-    known = spread > 1e-12 * x.var() * y.var()  # else all episodes of the resample have the same score
-    if known.mean() < 1 - TAIL:
-        return Estimate(value, -1.0, 1.0)
-    resampled = (xy - mean_x * mean_y)[known] / np.sqrt(spread[known])
-    most = 1 - 1e-9  # at 1, Fisher's scale has no end
-    error = np.arctanh(resampled.clip(-most, most)).std() * np.sqrt(count / (count - 1))
-    half = stats.t.ppf(1 - TAIL, count - 1) * max(error, 1 / np.sqrt(one.size - 3))
-    middle = np.arctanh(np.clip(value, -most, most))
-    return Estimate(value, float(np.tanh(middle - half)), float(np.tanh(middle + half)))
+
+    def correlated(drawn: Ints) -> Floats:
+        return spearman(*(values.T[drawn].reshape(*drawn.shape[:-1], -1) for values in (one, other)))
+
+    drawn = np.random.default_rng(seed).integers(count, size=(RESAMPLES, count))
+    spread = np.concatenate([correlated(part) for part in np.array_split(drawn, BATCHES)])
+    tail = stats.norm.cdf(stats.t.ppf(TAIL, count - 1) * np.sqrt(count / (count - 1)))
+    low, high = _ends(spread, -1.0, 1.0, tail)
+    value = float(correlated(np.arange(count)))
+    if abs(value) > 1 - 1e-12:  # scenes that all agree are as certain as a share of as many
+        certain = share_interval(count, count)[0]
+        low, high = min(low, certain), max(high, -certain)
+    return Estimate(value, low, high)
 
 
 def alike_pairs(success: Bools) -> list[tuple[int, int]]:

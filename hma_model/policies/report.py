@@ -72,7 +72,7 @@ def sentences(found: PolicyEvaluation) -> list[str]:
         f"judge on generated frames, vs the simulator under the same actions: {found.generated}",
         f"precision: the simulator confirms {_share(found.precision)} of the model's successes ({guessed} by "
         f"chance); recall: the model shows {_share(found.recall)} of the simulator's successes, same actions",
-        f"per-episode scores under the same actions: correlation {found.followed}, AUROC {found.auroc}",
+        f"per-episode scores under the same actions: rank correlation {found.followed}, AUROC {found.auroc}",
         f"model vs simulator, each under its own actions: precision {_share(paired['precision'])}, "
         f"recall {_share(paired['recall'])}, AUROC of scores {paired['auroc']}",
     ]
@@ -158,7 +158,7 @@ def html(found: PolicyEvaluation) -> str:
     figures = [
         (found.precision, "of the model's successes are confirmed by the simulator"),
         (found.recall, "of the simulator's successes are shown by the model"),
-        (found.followed, "correlation of per-episode scores"),
+        (found.followed, "rank correlation of per-episode scores"),
         (found.auroc, "AUROC of per-episode scores"),
     ]
     if not found.refusal:

@@ -132,8 +132,8 @@ class PolicyEvaluation:
         generated: accuracy of the judge on generated frames, against the simulator under the same actions.
         precision: share of the successes that it sees on generated frames which the simulator confirms.
         recall: share of the simulator's successes under these actions that it sees.
-        followed: how the scores of single episodes, as judged on generated frames, correlate with the true
-            ones under the same actions.
+        followed: how the ranks of the scores of single episodes, as judged on generated frames, correlate
+            with those of the true ones under the same actions.
         auroc: how well these scores tell the simulator's successes under these actions from its failures.
         paired: "precision", "recall" and "auroc" of the episodes in the model, against the episodes of the
             same start in the simulator, where the policy acted by itself.
@@ -213,7 +213,7 @@ class PolicyEvaluation:
                 "generated": asdict(self.generated),
                 "precision": asdict(self.precision),
                 "recall": asdict(self.recall),
-                "score_correlation": asdict(self.followed),
+                "score_rank_correlation": asdict(self.followed),
                 "auroc": asdict(self.auroc),
                 "generated_better_than_chance": self.generated.better_than_chance,
             },

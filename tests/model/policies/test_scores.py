@@ -251,12 +251,19 @@ def test_a_model_abstains_where_it_expects_a_large_error_of_its_own(judge, monke
 
 
 def test_outcomes_alone_are_no_verdict_where_scores_say_nothing(judge: StateJudge) -> None:
-    true = np.where(np.arange(24) < 12, 8.0, 2.0)
-    read = np.where(true >= 5, 5.1, 4.9)
-    read[0] = read[20] = -900.0  # one success and one failure are lost: outcomes hold, scores do not
+    true = np.where(np.arange(24) < 6, 8.0, 2.0) + np.arange(24) / 24
+    read = np.where(true >= 5, 8.0, 2.0) - np.arange(24) / 24  # of like outcomes, the better score less
     found = evaluation(judge, [scored_as(f"p{number}", read, true) for number in range(3)])
     assert found.generated.better_than_chance and found.precision.value == 1
     assert "no better than chance" in found.refusal and "Pearson" not in " ".join(sentences(found))
+
+
+def test_a_few_lost_episodes_do_not_refuse_a_verdict(judge: StateJudge) -> None:
+    true = np.where(np.arange(24) < 12, 8.0, 2.0) + np.arange(24) % 5
+    read = true.copy()
+    read[[0, 20]] = -900.0
+    found = evaluation(judge, [scored_as(f"p{number}", read, true) for number in range(3)])
+    assert found.refusal == "" and found.followed.low > 0.4
 
 
 def test_policies_that_cannot_be_told_apart_are_named(judge: StateJudge) -> None:
