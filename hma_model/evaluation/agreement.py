@@ -8,9 +8,10 @@ Clopper and Pearson (1934), for as many episodes as independent ones would tell 
 M policies, N episodes, R resamples. All intervals hold 95 %.
 """
 
+import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -166,22 +167,31 @@ def rank_violation(true: ArrayLike, made: ArrayLike) -> Floats:
     A policy's violation is the largest true difference from a policy that the model orders otherwise. Ties
     count as in SIMPLER (Li et al. 2024): only "greater" and "not greater" are compared.
     """
+    return _violations(true, made).max(axis=-1).mean(axis=-1)
+
+
+def _violations(true: ArrayLike, made: ArrayLike) -> Floats:
+    """Return the true differences (…, M, M) of policies (…, M) that the model orders otherwise, else 0."""
     true, made = np.asarray(true), np.asarray(made)
     gaps = true[..., :, None] - true[..., None, :]
     wrong = (gaps > 0) != (made[..., :, None] > made[..., None, :])
-    return np.where(wrong, np.abs(gaps), 0.0).max(axis=-1).mean(axis=-1)
+    return np.where(wrong, np.abs(gaps), 0.0)
 
 
 def mmrv(true: Floats, made: Floats, seed: int = 0) -> Estimate:
     """Return the MMRV of the means of two judgements (M, N) of the same episodes.
 
-    A resample draws episodes, jointly for all policies and both judgements; the policies stay.
+    A resample draws episodes, jointly for all policies and both judgements; the policies stay. Where the
+    model hardly parts its policies, all resamples violate some order, each another. So the interval begins
+    no higher than the MMRV of those pairs that nearly all resamples violate (Bonferroni's share).
     """
     if reason := _too_little(true):
         return Estimate(None, reason=reason)
-    value = rank_violation(true.mean(axis=1), made.mean(axis=1))
-    spread = rank_violation(*_resampled((true, made), seed))
-    return _mirrored(value, spread, 0.0, float(np.ptp(true)))
+    means, drawn = (true.mean(axis=1), made.mean(axis=1)), _resampled((true, made), seed)
+    found = _mirrored(rank_violation(*means), rank_violation(*drawn), 0.0, float(np.ptp(true)))
+    doubt = 1 - (_violations(*drawn) > 0).mean(axis=0)
+    sure = np.where(doubt < TAIL / math.comb(len(true), 2), _violations(*means), 0.0)
+    return replace(found, low=min(found.low or 0.0, float(sure.max(axis=-1).mean())))
 
 
 def _drawn_episodes(count: int, seed: int) -> Floats:

@@ -149,7 +149,7 @@ def drawn_scores(kind: str, rng: np.random.Generator, policies: int, count: int)
 
 @pytest.mark.parametrize("kind", ["plain", "outliers", "outcomes", "ties", "scenes"])
 def test_intervals_of_correlating_scores_hold_the_true_one(kind: str, monkeypatch) -> None:
-    """Where one episode in twenty is an outlier, that of Pearson's correlation held it in 66 %, and 0 often."""
+    """With one outlier in twenty episodes, that of Pearson's correlation held it in 66 %, and 0 often."""
     monkeypatch.setattr(agreement, "RESAMPLES", 400)
     monkeypatch.setattr(agreement, "BATCHES", 1)
     policies, draws = 5 if kind == "scenes" else 1, 100
@@ -314,7 +314,7 @@ def test_intervals_of_mmrv_and_auroc_resample_the_episodes_of_all_policies_toget
     assert mmrv(one, one).value == 0 and auroc(one > 0, one).low < 1  # 40 starts are never certain
 
 
-@pytest.mark.parametrize(("scenes", "model"), [(64, 0.6), (16, 1.0)])
+@pytest.mark.parametrize(("scenes", "model"), [(64, 0.6), (16, 1.0), (64, 0.05)])
 def test_intervals_over_policies_hold_what_more_episodes_would_show(scenes: int, model: float) -> None:
     """The model orders all policies rightly, but parts them less: single episodes often do not show it."""
     rates = np.linspace(0.3, 0.7, 6)[:, None]
@@ -325,7 +325,8 @@ def test_intervals_over_policies_hold_what_more_episodes_would_show(scenes: int,
         found = correlations(true, made, seed) | {"mmrv": mmrv(true, made, seed)}
         for name, one in found.items():
             held[name] += one.low - 1e-9 <= (0 if name == "mmrv" else 1) <= one.high + 1e-9
-    assert min(held.values()) >= 0.85 * draws, held
+    told = held.values() if model > 0.5 else [held["mmrv"]]  # else all resamples violate some order
+    assert min(told) >= 0.85 * draws, held
 
 
 def test_a_model_that_turns_the_order_round_violates_it_by_the_largest_differences() -> None:
