@@ -39,7 +39,7 @@ from hma_model.generation.decode import decode
 
 TRAINING_STEPS, LEARNING_RATE = 600, 4e-3
 IMAGE_LIMIT, EPISODES_NEEDED = 1500, 5  # most pictures to learn from, fewest episodes
-HELD_OUT_SHARE = 0.2  # share of the pictures, the last ones, on which the reader's error is measured
+HELD_OUT_SHARE = 0.2  # least share of the pictures, of the last recordings, that only measure the error
 READER_VALUES = ("mean", "std", "low", "high", "error", "spread")  # of a reader, beside its network
 LEAST_STD = 1e-6  # a value whose standard deviation is smaller never changes
 
@@ -87,6 +87,7 @@ class Reader:
 def learn(
     pictures: Images,
     states: Floats,
+    recordings: Ints,
     seed: int = 0,
     steps: int = TRAINING_STEPS,
     tell: Tell = lambda words: None,
@@ -94,21 +95,26 @@ def learn(
     """Train a reader on pictures whose state is known.
 
     Args:
-        pictures: (N, H, W, 3), by episode.
+        pictures: (N, H, W, 3).
         states: (N, S).
+        recordings: (N,) those of the pictures; two or more. The last ones only measure the error.
         seed: of the training.
         steps: of the training.
         tell: called with how far it is.
     """
-    used, small = round(len(pictures) * (1 - HELD_OUT_SHARE)), resized(pictures)
-    mean, std = states[:used].mean(axis=0), states[:used].std(axis=0)
+    names, counts = np.unique(recordings, return_counts=True)
+    since = counts[::-1].cumsum()[::-1]  # pictures of each recording and of those after it
+    first = max(int((since >= HELD_OUT_SHARE * len(pictures)).sum()) - 1, 1)
+    other = recordings >= names[first]
+    small, known = resized(pictures), states[~other]
+    mean, std = known.mean(axis=0), known.std(axis=0)
     scaled = (states - mean) / np.maximum(std, LEAST_STD)
     make = partial(StateNetwork, states.shape[1])
-    network = trained(make, small[:used], scaled[:used], seed, steps, LEARNING_RATE, 0.1, tell)
-    other = scaled[used:]
-    error = np.abs(outputs(network, small[used:]) - other).mean(axis=0)
-    spread = np.abs(other - np.median(other, axis=0)).mean(axis=0)
-    return Reader(network, mean, std, states[:used].min(axis=0), states[:used].max(axis=0), error, spread)
+    network = trained(make, small[~other], scaled[~other], seed, steps, LEARNING_RATE, 0.1, tell)
+    tested = scaled[other]
+    error = np.abs(outputs(network, small[other]) - tested).mean(axis=0)
+    spread = np.abs(tested - np.median(tested, axis=0)).mean(axis=0)
+    return Reader(network, mean, std, known.min(axis=0), known.max(axis=0), error, spread)
 
 
 def measure_recorded_state(
@@ -149,7 +155,7 @@ def measure_recorded_state(
     hashable: Any = tokenizer
     reader = _kept_reader(hashable, shards, cameras if isinstance(cameras, str) else tuple(cameras), seed)
     if reader is None:
-        return missing("the states of the training split are unknown in part")
+        return missing("fewer than two recordings of the training split have known states")
     errors: dict[str, list[Floats]] = {}
     for number, batch in enumerate(batches):
         truth = decode(tokenizer, batch.stored)
@@ -192,7 +198,7 @@ def measure_recorded_state(
 def recorded_reader(
     tokenizer: Tokenizer, shards: ShardSet, cameras: Cameras, seed: int, tell: Tell = lambda words: None
 ) -> Reader | None:
-    """Train the reader of a set on its training split; None if all of its states are unknown in part.
+    """Train the reader of a set on its training split; None if fewer than two recordings have known states.
 
     Args:
         tokenizer: of the shards.
@@ -205,11 +211,12 @@ def recorded_reader(
     seen = dataset.batch(evenly(len(dataset), IMAGE_LIMIT))
     wanted = _States(shards).of(seen, 1)[:, 0]
     known = np.isfinite(wanted).all(axis=1)
-    if not known.any():
+    recordings = shards.recordings(episodes_of([seen]))[known]
+    if len(np.unique(recordings)) < 2:
         return None
 
     def make() -> Reader:
-        return learn(decode(tokenizer, seen.stored)[known, 0], wanted[known], seed, tell=tell)
+        return learn(decode(tokenizer, seen.stored)[known, 0], wanted[known], recordings, seed, tell=tell)
 
     told = file_sha256(shards.folder / MANIFEST)
     return _kept("recorded_reader", tokenizer, {"manifest": told, "cameras": cameras, "seed": seed}, make)
@@ -226,7 +233,7 @@ def simulated_reader(
     def make() -> Reader:
         pictures, made = shown_episodes(robot, tokenizer, stride, seed, tell)
         states = np.concatenate([one.states for one in made]).astype(np.float64)
-        return learn(pictures, states, seed, tell=tell)
+        return learn(pictures, states, np.repeat(np.arange(len(made)), len(made[0].states)), seed, tell=tell)
 
     return _kept("simulated_reader", tokenizer, {"robot": robot, "stride": stride, "seed": seed}, make)
 

@@ -70,7 +70,7 @@ def test_what_is_in_the_picture_is_read_and_the_rest_is_left_out() -> None:
     pictures, parts = scenes(400, 0)
     noise = np.random.default_rng(1).normal(size=(len(parts), 1))
     states = np.concatenate([parts[:, 0] / 1000, noise, np.ones_like(noise)], axis=1)  # metres, say
-    reader = learn(pictures, states, steps=STEPS)
+    reader = learn(pictures, states, np.arange(len(parts)) // 20, steps=STEPS)
     assert reader.readable.tolist() == [0, 1]
     assert (reader.error[:2] < 0.25).all() and reader.error[2] > 0.6
     moved = states + np.array([reader.std[0], 0, 0, 0])
@@ -103,6 +103,37 @@ def test_errors_are_of_the_recorded_steps(disc: ShardSet, monkeypatch: pytest.Mo
     assert found["copy"]["error_sd_by_frame"][0] < found["copy"]["error_sd_by_frame"][-1]
 
 
+@pytest.mark.parametrize(
+    ("counts", "fitted"), [((9, 5, 5, 1), {0, 1}), ((10, 10, 10, 10, 10), {0, 1, 2, 3}), ((2, 40), {0})]
+)
+def test_the_error_is_of_whole_recordings_that_are_not_learned_from(counts, fitted, monkeypatch) -> None:
+    own = np.arange(len(counts)).repeat(counts)
+    seen = list[np.ndarray]()
+
+    def trained(make: Any, small: np.ndarray, *_: Any) -> Any:
+        seen.append(small)
+        return make().eval()
+
+    monkeypatch.setattr(recorded_state, "trained", trained)
+    pictures = np.broadcast_to(own[:, None, None, None], (len(own), 64, 64, 3)).astype(np.uint8)
+    learn(pictures, own[:, None] * 1.0, own)
+    assert set(np.unique(seen)) == fitted and len(seen[0]) == sum(counts[: len(fitted)])
+
+
+def test_the_reader_of_a_set_learns_from_some_of_its_recordings(disc, monkeypatch) -> None:
+    given = list[np.ndarray]()
+
+    def kept(pictures: np.ndarray, states: np.ndarray, recordings: np.ndarray, *_: Any, **__: Any) -> Reader:
+        given.append(recordings)
+        return exact()
+
+    monkeypatch.setattr(recorded_state, "learn", kept)
+    assert recorded_state.recorded_reader(BlockTokenizer(), disc, "first", 0) is not None
+    assert len(np.unique(given[0])) == disc.manifest.splits["train"]["episodes"]
+    monkeypatch.setattr(ShardSet, "recordings", lambda self, episodes: np.zeros(len(episodes), np.int64))
+    assert recorded_state.recorded_reader(BlockTokenizer(), disc, "first", 0) is None  # all of one recording
+
+
 def exact(*_: Any, **__: Any) -> Reader:
     one = np.ones(4)
     return Reader(recorded_state.StateNetwork(len(one)), one, one, one, one, 0 * one, one)
@@ -132,7 +163,7 @@ def test_a_set_whose_states_are_all_unknown_in_part_has_no_reader(disc, monkeypa
     found, last = measure_recorded_state(
         BlockTokenizer(), disc, batches, made, prompt=PROMPT, cameras="first"
     )
-    assert found["missing"] == "the states of the training split are unknown in part"
+    assert found["missing"] == "fewer than two recordings of the training split have known states"
     assert np.isnan(last).all()
 
 
