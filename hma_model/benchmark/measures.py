@@ -95,27 +95,34 @@ def decisions(true: NDArray[Any], made: NDArray[Any], seed: int) -> Arrays:
     rows = np.arange(len(true))
     goal = np.random.default_rng([seed, 53]).integers(true.shape[1], size=len(true))
     wanted = true[rows, goal][:, None]
-    far, seen = (np.linalg.norm(ends - wanted, axis=-1).mean(axis=-1).round(3) for ends in (true, made))
+    far, seen = (distance(ends, wanted).round(3) for ends in (true, made))
     right = far[rows, seen.argmin(axis=1)] <= REACHED_PX
     return {"goal": goal, "true_px": far, "made_px": seen, "right": right}
+
+
+def distance(one: NDArray[Any], other: NDArray[Any]) -> Floats:
+    """Return the mean distance (…) of places (…, P, 2); NaN where no part is read."""
+    far = np.linalg.norm(one - other, axis=-1)
+    return far.mean(axis=-1) if far.shape[-1] else np.full(far.shape[:-1], np.nan)
 
 
 def choice_figures(arrays: Arrays, seed: int) -> tuple[dict[str, Any], dict[str, Any], Arrays]:
     """Return the figures of `choose`, those of each scene, and what the decisions go by."""
     signal, copied = arrays["psnr"].mean(axis=1), arrays["copy_psnr"].mean(axis=1)  # (N, T)
-    errors = np.linalg.norm(arrays["made"] - arrays["true"], axis=-1).mean(axis=(1, 3))
+    errors = distance(arrays["made"], arrays["true"]).mean(axis=1)
     choices = decisions(arrays["true"][:, :, -1], arrays["made"][:, :, -1], seed)
     right = choices.pop("right").astype(float)
     found = horizon_summary("psnr", signal, seed, within=PSNR_RANGE)
     found |= summary("copy_psnr", copied.mean(axis=1), seed, within=PSNR_RANGE)
     found |= summary("copy_psnr_last", copied[:, -1], seed, within=PSNR_RANGE)
     found |= horizon_summary("error_px", errors, seed, within=NATURAL)
-    ends = np.array(share_interval(int(right.sum()), len(right)))
-    found |= {
-        "decision": rounded(right.mean()),
-        "decision_95": rounded(ends),
-        "chance": rounded((choices["true_px"] <= REACHED_PX).mean()),
-    }
+    found |= {"decision": None, "decision_95": None, "chance": None}
+    if np.isfinite(errors).all():
+        ends = np.array(share_interval(int(right.sum()), len(right)))
+        found |= {"decision": rounded(right.mean()), "decision_95": rounded(ends)}
+        found["chance"] = rounded((choices["true_px"] <= REACHED_PX).mean())
+    else:  # nothing tells which sequence is nearest
+        right[:] = np.nan
     by_scene = {
         "psnr": signal.mean(axis=1),
         "psnr_last": signal[:, -1],
@@ -130,7 +137,7 @@ def frame_errors(arrays: Arrays) -> Arrays:
     """Return what came of each frame (N, C, T) of `choose`, rounded as it is written to the results."""
     return {
         "uncertainty": arrays["uncertainty"].round(4),
-        "error_px": np.linalg.norm(arrays["made"] - arrays["true"], axis=-1).mean(axis=-1).round(3),
+        "error_px": distance(arrays["made"], arrays["true"]).round(3),
         "pixel_rmse": (255 * 10 ** (-arrays["psnr"] / 20)).round(3),
     }
 
@@ -162,10 +169,7 @@ def turn_back(world: World, scenes: Scenes, probe: Probe, frames: int) -> Arrays
         true.step(action)
 
     def far(places: NDArray[Any]) -> NDArray[Any]:
-        if not len(probe.own):
-            return np.full(len(places), np.nan)
-        moved = np.linalg.norm(places[:, 1] - places[:, 0], axis=-1)
-        return moved[:, probe.own].mean(axis=-1)
+        return distance(*places[:, :, probe.own].swapaxes(0, 1))
 
     ends, turn = made[:, [0, -1]], made[:, [0, there]]
     return {

@@ -13,6 +13,7 @@ from hma_data.errors import OutputError, UsageError
 from hma_data.storage.files import short_sha256, write_atomic
 from hma_data.tables import Table
 from hma_model.benchmark.planning import difference
+from hma_model.evaluation.agreement import Estimate
 from hma_model.evaluation.intervals import ends_of, interval
 from hma_model.evaluation.pages import Page
 from hma_model.evaluation.plots import COLOURS, MARKERS, label_axes, svg_bytes
@@ -95,8 +96,7 @@ def _measures(one: dict[str, Any]) -> Iterator[tuple[str, str, str, str]]:
         reason = policies.get("missing") or found["reason"]
         if policies.get("refused") and path.startswith("correlation"):
             reason = policies["refused"]  # as hma policy-eval shows none then
-        ends = None if found.get("low") is None else [found["low"], found["high"]]
-        yield path, measure, f"not measured: {reason}" if reason else _shown(found["value"], ends), ""
+        yield path, measure, f"not measured: {reason}" if reason else str(Estimate(**found)), ""
 
 
 def _shown(number: float | None, ends: list[float] | None) -> str:

@@ -121,13 +121,13 @@ def accumulated(uncertainty: Floats) -> Floats:
     return np.cumsum(uncertainty**POWER, axis=-1) ** (1 / POWER)
 
 
-def missing(uncertainty: Floats) -> str:
-    """Say why uncertainty (N, C, T) cannot be calibrated; "" if it can."""
+def missing(uncertainty: Floats, errors: Floats) -> str:
+    """Say why uncertainty (N, C, T) cannot be calibrated to state errors (N, C, T); "" if it can."""
     if not np.isfinite(uncertainty).all():
         return NO_UNCERTAINTY
     if len(uncertainty) < MIN_SCENES:
         return f"{len(uncertainty)} of at least {MIN_SCENES} scenes"
-    return ""
+    return "" if np.isfinite(errors).all() else "the probe locates no part"
 
 
 def fit(stated: Floats, errors: Floats) -> tuple[Floats, Floats]:
@@ -192,7 +192,7 @@ def calibration(
         by the share that is kept; `half_gain_px`, by how much that of half the episodes is smaller than
         that of all; of warnings `right`, `clock`, `gain`, `misses` and `false_alarms`; and the `meter`.
     """
-    if reason := missing(uncertainty):
+    if reason := missing(uncertainty, errors):
         return {"missing": reason}
     stated = accumulated(uncertainty)
     frames = stated.shape[-1]

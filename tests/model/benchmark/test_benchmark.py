@@ -92,6 +92,33 @@ def test_a_flawless_model_has_every_figure_at_its_best_and_a_frozen_one_guesses(
     assert other["inverse"]["return_px"] == other["inverse"]["turn_px"] == 0
 
 
+class Blind(KnownPlaces):
+    own = loose = np.array([], np.int64)
+
+
+def test_a_probe_that_reads_nothing_measures_no_decision_and_no_calibration(tmp_path, monkeypatch) -> None:
+    blind: Any = Blind(monkeypatch)
+    monkeypatch.setattr(running, "train_probe", lambda *given: blind)
+    monkeypatch.setattr(running._Robot, "_policies", lambda self: json.dumps({"missing": "no judge"}))
+    world = world_of(FrozenWorld)
+    stated = running.choose
+
+    def choose(*given: Any) -> Any:
+        found = stated(*given)
+        return found | {"uncertainty": np.ones_like(found["uncertainty"])}
+
+    monkeypatch.setattr(running, "choose", choose)
+    found = benchmark("it", tmp_path, replace(TINY, scenes=8), world=world)
+    write_report(found, tmp_path)
+    one = found["measures"][ROBOT]
+    assert one["decision"] is one["decision_95"] is one["chance"] is one["error_px"] is None
+    assert one["calibration"] == {"missing": "the probe locates no part"}
+    shown = {row[1]: row[2] for row in rows(found)}
+    assert shown["decision fidelity, share of right choices among 5"] == "not measured"
+    assert "nan" not in (tmp_path / "benchmark.md").read_text().lower()
+    assert ">None<" not in (tmp_path / "benchmark.html").read_text()
+
+
 def test_the_calibration_is_recomputed_from_what_is_written(tmp_path, monkeypatch) -> None:
     uncertainty, errors = rollouts(4.0, scenes=12)
     made = np.zeros((*errors.shape, 1, 2))
