@@ -78,7 +78,7 @@ class Accuracy:
     def __str__(self) -> str:
         counts = f"{self.count} episodes, {self.successes} success{'es' * (self.successes != 1)}"
         if self.balanced is None:
-            return f"{self.share:.0%} right; all episodes have the same outcome ({counts})"
+            return f"not computed: all episodes have the same outcome ({counts})"
         few = f"; too few {self.too_few} to tell" if self.too_few else ""
         return f"balanced {self.balanced:.0%} ({self.low:.0%} to {self.high:.0%}; {counts}{few})"
 

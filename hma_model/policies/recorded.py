@@ -126,7 +126,9 @@ class ModelEvaluation:
 
     def table(self) -> list[list[Any]]:
         """Return a row of COLUMNS for each policy."""
-        return [[row["policy"], rate(row, "model"), round(row["model_score"], 2)] for row in self.rows()]
+        return [
+            [row["policy"], rate(row, "model_success"), round(row["model_score"], 2)] for row in self.rows()
+        ]
 
 
 def evaluate_recorded(

@@ -41,21 +41,21 @@ def table(found: PolicyEvaluation) -> list[list[Any]]:
     return [
         [
             row["policy"],
-            rate(row, "true"),
-            rate(row, "model"),
+            rate(row, "true_success"),
+            rate(row, "model_success"),
             round(row["true_score"], 1),
             round(row["model_score"], 1),
-            f"{row['episodes_alike']:.0%}",
-            rate(row, "replayed"),
+            rate(row, "episodes_alike"),
+            rate(row, "replayed_success"),
         ]
         for row in found.rows()
     ]
 
 
 def rate(row: dict[str, Any], name: str) -> str:
-    """Return the share of successes of a row in words, with its interval."""
-    low, high = row[f"{name}_success_interval"]
-    return f"{row[f'{name}_success']:.0%} ({low:.0%}–{high:.0%})"
+    """Return a share of a row in words, with its interval."""
+    low, high = row[f"{name}_interval"]
+    return f"{row[name]:.0%} ({low:.0%}–{high:.0%})"
 
 
 def sentences(found: PolicyEvaluation) -> list[str]:
@@ -112,7 +112,7 @@ def abstained(found: Abstention) -> str:
 
 def _share(found: Estimate) -> str:
     if found.low is None or found.value is None:
-        return f"none ({found.reason})"
+        return f"an unknown share ({found.reason})"
     return f"{found.value:.0%} ({found.low:.0%} to {found.high:.0%})"
 
 

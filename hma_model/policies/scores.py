@@ -189,7 +189,9 @@ class PolicyEvaluation:
                 row[f"{name}_success"] = float(success.mean())
                 row[f"{name}_success_interval"] = share_interval(int(success.sum()), len(success))
                 row[f"{name}_score"] = float(scores.mean())
-            row["episodes_alike"] = float((one.success[TRUE] == one.success[MODEL]).mean())
+            alike = one.success[TRUE] == one.success[MODEL]
+            row["episodes_alike"] = float(alike.mean())
+            row["episodes_alike_interval"] = share_interval(int(alike.sum()), len(alike))
             rows.append(row)
         return rows
 

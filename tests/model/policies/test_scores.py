@@ -29,7 +29,7 @@ from hma_model.policies.base import begin, checked
 from hma_model.policies.catalog import read_policy
 from hma_model.policies.judge import StateJudge, task_of
 from hma_model.policies.recorded import ModelEvaluation, Played
-from hma_model.policies.report import html, sentences, write_report
+from hma_model.policies.report import html, sentences, table, write_report
 from hma_model.policies.scores import (
     MODEL,
     REPLAYED,
@@ -154,6 +154,10 @@ def test_shares_have_exact_intervals_and_too_few_successes_are_said(still: Polic
     assert row["true_success"] == 0 and row["true_success_interval"] == pytest.approx((0, 0.369), abs=1e-3)
     doubt = "there are too few scenes with successes to tell whether the judge is better"
     assert any(doubt in sentence for sentence in sentences(found))
+    assert row["episodes_alike"] == 1 and row["episodes_alike_interval"][0] == pytest.approx(0.631, abs=1e-3)
+    assert "100% (63%–100%)" in str(table(found))  # of eight episodes
+    assert "recall: the model shows an unknown share (nothing truly succeeds)" in str(sentences(found))
+    assert str(found.generated).startswith("not computed: all episodes have the same outcome (8 episodes")
     page = html(found)
     assert page.count(doubt) == 1 and page.index(doubt) < page.index("<table")
     for high, said in (
