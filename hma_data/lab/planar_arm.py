@@ -56,9 +56,8 @@ def record(part: Path, robot: str, episodes: Iterable[int], seed: int) -> None:
 
 
 def _as_lerobot(demo: Demo) -> LeRobotEpisode:
-    seen = demo.observations
-    state = np.concatenate([seen["joint_pos"], seen["joint_vel"]], axis=1).astype(np.float32)
-    return LeRobotEpisode({"observation.images.top": seen["image"]}, demo.actions, state, TASK)
+    state = demo.states[:, :4].astype(np.float32)  # joint angles and velocities
+    return LeRobotEpisode({"observation.images.top": demo.observations["image"]}, demo.actions, state, TASK)
 
 
 class PlanarArm:

@@ -9,9 +9,8 @@ Q values of a pose, A of an action, P own parts, B blocks; places are px of an i
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
-from typing import Protocol
 
 import numpy as np
 
@@ -24,9 +23,7 @@ from hma_data.lab.family.table import REACH, BlockTable
 from hma_data.lab.simulator import Simulation
 
 PUSHER = "pusht_fast"
-STARTS, ROUNDS = 24, 8  # random poses that a first search begins from, and steps of a search
-DAMPING, NUDGE = 1.0, 1e-3  # px² of the search; of a pose whose axes are scaled to the width of their limits
-CLOSE = 1e-4  # step in that scale at which a search ends
+STARTS, ROUNDS = 24, 20  # random poses that a first search begins from, and steps of a search
 
 
 @dataclass(frozen=True)
@@ -81,21 +78,7 @@ def driver(robot: str, pose: Floats, rng: np.random.Generator) -> Callable[[Scen
     return action
 
 
-class SeenState(Protocol):
-    """The state of a steerable robot, as frames and actions tell it."""
-
-    @property
-    def state(self) -> SceneState:
-        """Return the state as it is now."""
-
-    def move(self, action: Float32s) -> None:
-        """Take an action (A,) that was given, until the next frame."""
-
-    def see(self, places: Floats) -> None:
-        """Take the places (P + B, 2) of a new frame."""
-
-
-def seen_state(robot: str, own: Ints, places: Floats) -> SeenState:
+def seen_state(robot: str, own: Ints, places: Floats) -> "SeenPush | SeenPose":
     """Return the state of a steerable robot in a first frame.
 
     Args:
@@ -109,21 +92,20 @@ def seen_state(robot: str, own: Ints, places: Floats) -> SeenState:
 class SeenPush:
     """The state of pusht_fast: the pusher follows its target with the lag of its spring."""
 
-    _agent: Floats
-    _tee: Floats
+    state: SceneState
 
     def __init__(self, places: Floats) -> None:
         self.see(places)
 
-    @property
-    def state(self) -> SceneState:
-        return SceneState(self._agent, self._tee, False)
-
     def move(self, action: Float32s) -> None:
-        self._agent = self._agent + (action - self._agent) * (1 - np.exp(-pusht.FAST_PERIOD_S / pusht.LAG_S))
+        """Take an action (A,) that was given, until the next frame."""
+        agent = self.state.pose
+        moved = agent + (action - agent) * (1 - np.exp(-pusht.FAST_PERIOD_S / pusht.LAG_S))
+        self.state = replace(self.state, pose=moved)
 
     def see(self, places: Floats) -> None:
-        self._agent, self._tee = places[0] / pusht.PX, places[1:]
+        """Take the places (P + B, 2) of a new frame."""
+        self.state = SceneState(places[0] / pusht.PX, places[1:], False)
 
 
 class SeenPose:
@@ -137,11 +119,12 @@ class SeenPose:
         self._width = high - low
         starts = np.random.default_rng(0).uniform(low, high, (STARTS, len(low)))
         found = [self._search(start, places) for start in starts]
-        self.pose = min(found, key=lambda pose: self._far(pose, places))
+        self.pose = min(found, key=lambda pose: float(np.square(self._miss(pose, places)).sum()))
         self._blocks = places[len(self._forward(self.pose)) :]
 
     @property
     def state(self) -> SceneState:
+        """Return the state as it is now."""
         holding = False
         if self._body is not None and self._body.grip and self._body.holds(self.pose):
             tip, _ = self._body.mechanism.tip(self.pose)
@@ -149,34 +132,25 @@ class SeenPose:
         return SceneState(self.pose, self._blocks, holding)
 
     def move(self, action: Float32s) -> None:
+        """See SeenPush."""
         if self._body is None:
             self.pose = self.pose + action / planar_arm.HZ
         else:
             self.pose = self._body.moved(self.pose, action.astype(np.float64))
 
     def see(self, places: Floats) -> None:
+        """See SeenPush."""
         self.pose = self._search(self.pose, places)
         self._blocks = places[len(places) - len(self._blocks) :]
 
-    def _far(self, pose: Floats, places: Floats) -> float:
-        return float(np.square(self._forward(pose)[self._own] - places[self._own]).sum())
+    def _miss(self, pose: Floats, places: Floats) -> Floats:
+        return (self._forward(pose)[self._own] - places[self._own]).ravel()
 
     def _search(self, pose: Floats, places: Floats) -> Floats:
-        """Return the pose near another whose parts lie at places: damped least squares."""
-        damping = DAMPING
-        for _ in range(ROUNDS):
-            here = self._forward(pose)[self._own]
-            miss = (places[self._own] - here).ravel()
-            nudges = np.diag(self._width * NUDGE)
-            slope = [((self._forward(pose + n)[self._own] - here) / NUDGE).ravel() for n in nudges]
-            jacobian = np.stack(slope, axis=1)
-            square = jacobian.T @ jacobian + damping * np.eye(len(pose))
-            step = np.linalg.solve(square, jacobian.T @ miss)
-            other = pose + step * self._width
-            if self._far(other, places) < self._far(pose, places):
-                pose, damping = other, damping / 10
-            else:
-                damping *= 10
-            if np.abs(step).max() < CLOSE:
-                break
-        return wrapped(pose) if self._body is None else self._body.bounded(pose)
+        """Return the pose near another whose parts lie at places."""
+        from scipy.optimize import least_squares
+
+        found: Floats = least_squares(
+            self._miss, pose, x_scale=self._width, max_nfev=ROUNDS, args=(places,)
+        ).x
+        return wrapped(found) if self._body is None else self._body.bounded(found)

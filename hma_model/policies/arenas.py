@@ -20,7 +20,7 @@ from hma_data.arrays import Float32s, Floats, Images
 from hma_data.episodes.images import resize
 from hma_data.errors import HMAError, UsageError
 from hma_data.lab import FAMILY, truth
-from hma_data.lab.scripted import PUSHER, SceneState, SeenState, seen_state, state_of, steerable
+from hma_data.lab.scripted import PUSHER, SceneState, SeenPose, SeenPush, seen_state, state_of, steerable
 from hma_data.lab.simulator import LabSimulator, simulated
 from hma_model.evaluation.probe import Probe
 from hma_model.generation.commands import OutsideRangeWarning, described
@@ -236,7 +236,7 @@ class ModelArena:
             self._first_states = true.first_states
         self.unsure: list[Floats] = []
         self._steps = 0
-        self._seen: list[SeenState] | None = None
+        self._seen: list[SeenPush | SeenPose] | None = None
 
     def outside(self, actions: Float32s) -> str:
         """Say which of the actions (N, A) leave the range seen in training; "" for none."""
