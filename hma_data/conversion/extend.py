@@ -36,20 +36,15 @@ from hma_data.episodes.images import prepared
 from hma_data.errors import EpisodeError, OutputError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import (
-    EPISODES,
-    QUARANTINE,
     SPLITS,
     Manifest,
-    damaged_files,
     derive,
     digest_of_texts,
-    restat_remedy,
     shard_sizes,
 )
 from hma_data.shards.schema import RowLayout, to_numpy
 from hma_data.sources.base import EpisodeRef, Source
 from hma_data.storage.records import Records
-from hma_data.storage.remote import parquet_file
 
 log = logging.getLogger(__name__)
 
@@ -79,19 +74,19 @@ def extended(
     Returns:
         a plan whose units are the new shards alone; where there are none, its facts are those of `base`.
     """
-    killed = _is_killed_extension(out, base)
+    sizes = shard_sizes(out)
+    for shard in base.shards:
+        if sizes.get(shard.path) != shard.bytes:
+            fault = f"is missing, or does not have the {shard.bytes:,} bytes of the manifest"
+            remedy = "restore it from a copy, or start over with --overwrite"
+            raise OutputError(out / shard.path, fault, remedy)
     if ways(plan.facts) != ways(base.plan):
         fault = f"cannot be extended; different: {differences(plan.facts, base.plan)}"
         raise OutputError(out, fault, "convert with the same settings, or choose another --out")
-    columns = ["id", "fingerprint", "content"]
-    if killed:
-        hashes = {shard.path: shard.sha256 for shard in base.shards}
-        there = derive(out, list(hashes), base.embodiment, base.plan, base.source, hashes)
-        known, lines = there.episodes.select(columns), there.quarantine.splitlines()
-    else:
-        known = parquet_file(out / EPISODES).read(columns=columns)
-        lines = (out / QUARANTINE).read_text("utf-8").splitlines()
-    refused = pa.array([json.loads(line)["id"] for line in lines], pa.string())
+    hashes = {shard.path: shard.sha256 for shard in base.shards}
+    there = derive(out, list(hashes), base.embodiment, base.plan, base.source, hashes)
+    known = there.episodes.select(["id", "fingerprint", "content"])
+    refused = pa.array([item.id for item in there.refused], pa.string())
     now = plan.table()
     place = pc.index_in(now["id"], known["id"])  # null for episodes that the set does not have
     other = now.filter(pc.not_equal(now["fingerprint"], known["fingerprint"].take(place)))
@@ -102,27 +97,6 @@ def extended(
     if not len(new):
         return Plan((), base.plan)
     return _with(base, Records(EpisodeRef, new), len(known) + len(refused), shard_frames)
-
-
-def _is_killed_extension(out: Path, base: Manifest) -> bool:
-    """Check whether an extension wrote derived files and was killed before the manifest.
-
-    Raises:
-        OutputError: a shard does not have its size, or derived files without an extension not their bytes.
-    """
-    sizes = shard_sizes(out)
-    for shard in base.shards:
-        if sizes.get(shard.path) != shard.bytes:
-            fault = f"is missing, or does not have the {shard.bytes:,} bytes of the manifest"
-            raise OutputError(
-                out / shard.path, fault, "restore it from a copy, or start over with --overwrite"
-            )
-    damaged = damaged_files(out, base)
-    killed = len(sizes) > len(base.shards)
-    if damaged and not killed:
-        fault = "is missing, or changed since the manifest was written"
-        raise OutputError(damaged[0], fault, restat_remedy(out))
-    return bool(damaged)
 
 
 def _refuse_changed(

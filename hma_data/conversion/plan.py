@@ -23,7 +23,6 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from hma_data.arrays import Ints
-from hma_data.console import human_count
 from hma_data.conversion.settings import Settings
 from hma_data.episodes.align import to_clip
 from hma_data.episodes.episode import Clip
@@ -396,8 +395,7 @@ def idle_workers(plan: Plan, todo: int, workers: int, tasks: int = 1, begun: boo
     """
     if todo >= workers:
         return ""
-    shards = human_count(todo, "shard") + (" left" if begun else "") + (" of this task" if tasks > 1 else "")
-    line = f"{shards}: {todo} of {workers} workers {'has' if todo == 1 else 'have'} work"
+    line = f"{todo} of {workers} workers have work"
     shortest = min((int(to_numpy(unit.refs.column("frames")).min()) for unit in plan.units), default=0)
     size = max(plan.frames // (tasks * workers * SHARDS_A_WORKER), shortest, 1)
     if begun or not any(unit.frames > size for unit in plan.units if len(unit) > 1):

@@ -74,11 +74,11 @@ def test_workers_without_a_shard_are_told_before_the_work_and_by_a_dry_run(toy_a
     write_toy(tmp_path / "toy.hdf5", [20] * 8)
     words = ["convert", "-e", tmp_path / "toy_arm.yaml", "--source", tmp_path / "toy.hdf5"]
     words += ["--tokenizer", "fsq-8", "--out", tmp_path / "out", "--workers", "3"]
-    line = "2 shards: 2 of 3 workers have work; --shard-frames 20 gives more"
+    line = "2 of 3 workers have work; --shard-frames 20 gives more"
     planned = hma(*words, "--dry-run")
     assert planned.stdout.splitlines()[-1] == line
     shared = [*words, "--shard-index", "2", "--shard-count", "4"]
-    empty = "0 shards of this task: 0 of 3 workers have work; --shard-frames 20 in every task gives more"
+    empty = "0 of 3 workers have work; --shard-frames 20 in every task gives more"
     planned = hma(*shared, "--dry-run")
     assert planned.stdout.splitlines()[-1] == empty
     assert "with --workers 3 in each of 4 tasks" in planned.stdout
@@ -86,7 +86,7 @@ def test_workers_without_a_shard_are_told_before_the_work_and_by_a_dry_run(toy_a
     assert line in hma(*words).stderr.splitlines()
     assert "workers have work" not in hma(*words).stderr  # all shards are there
     (tmp_path / "out/val/shard-00000.parquet").unlink()
-    assert "1 shard left: 1 of 3 workers has work" in hma(*words).stderr.splitlines()
+    assert "1 of 3 workers have work" in hma(*words).stderr.splitlines()
 
 
 UNGUARDED = """

@@ -1,7 +1,6 @@
 """Plans; plans, merges, splits and extensions over tables are those of plain loops over objects."""
 
 import hashlib
-import json
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -10,7 +9,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -27,7 +25,7 @@ from hma_data.conversion.plan import (
 from hma_data.conversion.rewrite import _joined, _together
 from hma_data.errors import SourceError
 from hma_data.registry.embodiment import Embodiment
-from hma_data.shards.manifest import EPISODES, QUARANTINE, digest
+from hma_data.shards.manifest import digest
 from hma_data.shards.schema import EpisodeRow, Refused
 from hma_data.sources.base import EpisodeRef
 from hma_data.storage.records import Records
@@ -136,13 +134,14 @@ def test_an_extension_is_that_of_plain_loops(base: Path, data: st.DataObject, re
     marks = {ref.id: "old" if state == "c" else ref.fingerprint for ref, state in zip(refs, states)}
     known = [*ids["k"], *ids["c"], "gone"]
     columns = {"id": known, "fingerprint": [marks.get(name, "") for name in known], "content": known}
-    pq.write_table(pa.table(columns), base / EPISODES)
-    lines = [json.dumps({"id": name, "uri": "", "type": "E", "message": ""}) + "\n" for name in ids["r"]]
-    (base / QUARANTINE).write_text("".join(lines))
+    there = SimpleNamespace(episodes=pa.table(columns), refused=[Refused(name, "E", "") for name in ids["r"]])
     plan = make_plan(refs, ARM, BlockTokenizer.spec, Settings(), "toy")
     manifest = SimpleNamespace(
         plan={**plan.facts, "recording": "r", "shards": "s"},
-        shards=[SimpleNamespace(split="train")] * 2 + [SimpleNamespace(split="val")],
+        shards=[
+            SimpleNamespace(path="p", split=split, bytes=9, sha256="") for split in ("train", "train", "val")
+        ],
+        **dict.fromkeys(("embodiment", "source")),
     )
     asked: list[str] = []
 
@@ -151,7 +150,8 @@ def test_an_extension_is_that_of_plain_loops(base: Path, data: st.DataObject, re
         return ref.id
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(extend, "_is_killed_extension", lambda out, base: False)
+        patch.setattr(extend, "shard_sizes", lambda out: {"p": 9})
+        patch.setattr(extend, "derive", lambda *given: there)
         made = extend.extended(base, manifest, plan, 100, content)  # type: ignore[arg-type]
     assert asked == ids["c"]
     splits = {ref.id: unit.split for unit in plan.units for _, ref in unit.episodes}
@@ -283,8 +283,7 @@ def test_workers_without_a_shard_are_told_with_the_size_that_gives_them_one(work
     few = plan(episodes, toy_arm)
     todo = len(few.units[::tasks])
     line = idle_workers(few, todo, workers, tasks)
-    assert line.startswith(f"{todo} shards" if todo > 1 else "1 shard")
-    assert f": {todo} of {workers} workers ha" in line
+    assert line.startswith(f"{todo} of {workers} workers have work")
     assert ("in every task" in line) == (tasks > 1)
     size = re.search(r"--shard-frames (\d+)( in every task)? gives more$", line)
     assert size
@@ -294,7 +293,7 @@ def test_workers_without_a_shard_are_told_with_the_size_that_gives_them_one(work
 
 def test_a_size_is_only_named_where_it_helps(toy_arm: Embodiment) -> None:
     alone = plan(refs(500, 500), toy_arm, Settings(shard_frames=100))  # a shard holds whole episodes
-    assert idle_workers(alone, 2, 8) == "2 shards: 2 of 8 workers have work"
+    assert idle_workers(alone, 2, 8) == "2 of 8 workers have work"
     few = plan(refs(*[50] * 100), toy_arm)
-    assert idle_workers(few, 1, 8, begun=True) == "1 shard left: 1 of 8 workers has work"
+    assert idle_workers(few, 1, 8, begun=True) == "1 of 8 workers have work"
     assert idle_workers(few, 2, 2) == idle_workers(few, 2, 0) == ""
