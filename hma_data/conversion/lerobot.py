@@ -490,9 +490,7 @@ class LeRobotHolder:
 
     def _conversion(self) -> Path | None:
         """Return the file of a dataset of ours in `out`; None where nothing is there."""
-        if self.out.is_file():
-            raise OutputError(self.out, "is a file", "choose an empty or new folder")
-        if not self.out.is_dir() or not any(self.out.iterdir()):
+        if not self.out.exists() or (self.out.is_dir() and not any(self.out.iterdir())):
             return None
         path = self.out / CONVERSION
         if not path.is_file() or not (self.out / "meta" / "info.json").is_file():

@@ -15,7 +15,7 @@ from typing import Any
 from hma_data.conversion.extend import ways
 from hma_data.conversion.plan import Plan, differences
 from hma_data.cpu import in_order
-from hma_data.errors import HMAError, OtherPlanError, OutputError, RegistryError, StorageAwayError
+from hma_data.errors import HMAError, OtherPlanError, OutputError, StorageAwayError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import (
     EMBODIMENT,
@@ -191,14 +191,7 @@ def yaml_change(before: Embodiment, now: Embodiment) -> str:
     """Return what of the YAML has changed, in words; empty if it is the same."""
     old, new = before.to_dict(), now.to_dict()
     keys = [key for key in {**old, **new} if old.get(key) != new.get(key)]
-    if not keys:
-        return ""
-    with suppress(RegistryError):  # nobody states the rate
-        if before.stride != now.stride:
-            said = f"stride {before.stride} → {now.stride}: the model now sees {now.effective_hz:g} Hz"
-            others = [key for key in keys if key not in ("target_hz", "stride", "provenance")]
-            return said + (f"; also new from the YAML: {', '.join(others)}" if others else "")
-    return f"new from the YAML: {', '.join(keys)}"
+    return f"new from the YAML: {', '.join(keys)}" if keys else ""
 
 
 # -- what is there
@@ -207,13 +200,9 @@ def yaml_change(before: Embodiment, now: Embodiment) -> str:
 def _refuse_foreign(out: Path) -> None:
     names = {item.name for item in out.iterdir()} - OURS - FILES_BESIDE
     foreign = sorted(name for name in names if not (name.endswith(PART) or name.startswith(WORKING)))
-    if foreign and (out / MANIFEST).is_file():
-        what, them = ("a file that is", "it") if len(foreign) == 1 else ("files that are", "them")
-        fault = f"holds {what} not of the set: {', '.join(foreign[:3])}"
-        raise OutputError(out, fault, f"move {them} out")
     if foreign:
-        fault = f"is not a shard set: it holds {', '.join(foreign[:3])}"
-        raise OutputError(out, fault, "choose an empty or new --out")
+        fault = f"holds what is not of a shard set: {', '.join(foreign[:3])}"
+        raise OutputError(out, fault, "move it out, or choose an empty or new --out")
 
 
 def refuse_other(out: Path, plan: Plan) -> None:

@@ -46,6 +46,7 @@ from hma_data.storage.fetch import EPISODE_WAITS_S as WAITS_S
 from hma_data.storage.fetch import disk_is_full, storage_is_away, worth_another_try
 
 SIGN_EVERY_S = 20.0
+PREFETCHED = 3  # items
 FATAL = TokenizerError, OutputError, ShardError, RegistryError, MissingDependencyError  # no episode's fault
 
 
@@ -379,15 +380,15 @@ def signs_of_life(report: Report) -> Iterator[None]:
         thread.join()
 
 
-def prefetch[T](items: Iterator[T], depth: int = 3) -> Iterator[T]:
-    """Yield the same items in the same order; a thread reads up to `depth` of them ahead.
+def prefetch[T](items: Iterator[T]) -> Iterator[T]:
+    """Yield the same items in the same order; a thread reads up to PREFETCHED of them ahead.
 
     An error of `items` is raised in the place of the item.
     """
     end = object()
     pool = ThreadPoolExecutor(1)
     try:
-        ahead = deque(pool.submit(next, items, end) for _ in range(depth))
+        ahead = deque(pool.submit(next, items, end) for _ in range(PREFETCHED))
         while (item := ahead.popleft().result()) is not end:
             ahead.append(pool.submit(next, items, end))
             yield cast(T, item)

@@ -132,8 +132,12 @@ def training_notes(folder: Path, out: Path, plan: Plan) -> list[str]:
     found = (window_finding(made), pause_finding(made))
     notes = [f"{out}: {off_rate}" if off_rate else ""]
     notes += [f"{out}: {one}" for one in found if one and one.severity != "info"]
-    if fault := _empty_val(made.manifest, plan):
-        notes.append(f"{out}: val is empty: {fault}")
+    wanted = plan.episodes > 1 and plan.facts["settings"]["val_fraction"] != 0
+    if wanted and not made.manifest.splits["val"]["episodes"]:
+        said = (
+            "its episodes are in quarantine.jsonl, or --limit, groups or the recording's own split left none"
+        )
+        notes.append(f"{out}: val is empty: {said}")
     return notes
 
 
@@ -151,19 +155,6 @@ def held_out_line(manifest: Manifest, plan: Plan) -> str:
     if 0 < count < HELD_OUT:
         said += f"; fewer than {HELD_OUT} are too few to judge a model: record more episodes"
     return said
-
-
-def _empty_val(manifest: Manifest, plan: Plan) -> str:
-    """Return why a set of several episodes has none for validation; empty where it has one or wants none."""
-    settings = plan.facts["settings"]
-    if manifest.splits["val"]["episodes"] or plan.episodes < 2 or settings["val_fraction"] == 0:
-        return ""
-    if any(unit.split == "val" for unit in plan.units):
-        return "its episodes were refused, see quarantine.jsonl"
-    if settings["limit"]:
-        fault = f"the recording's own split puts the first {plan.episodes:,} episodes in train"
-        return f"{fault}; use a larger --limit"
-    return "all episodes belong to one group, or to train in the recording's own split"
 
 
 def refusal_reasons(refused: Iterable[Mapping[str, Any]]) -> dict[str, int]:

@@ -313,9 +313,7 @@ def _check_alike(first: ShardSet, other: ShardSet) -> None:
     for what, (mine, theirs) in pairs.items():
         if mine != theirs:
             fault = f"cannot be merged with {first.folder}: its {what} is {theirs}, there it is {mine}"
-            remedy = "merge sets of one embodiment and one tokenizer"
-            if what == "frame stride":
-                remedy = "convert the recordings of the other with --frames strided"
+            remedy = "merge sets of one embodiment, one tokenizer and one choice of --frames"
             raise ShardError(other.folder, fault, remedy)
 
 
@@ -362,7 +360,10 @@ def restat(
     if not folder.is_dir():
         raise ShardError(folder, "is not a folder", "name the --out folder of an hma convert")
     with locked(folder):
-        known = _whole_manifest(folder)
+        known: Manifest | None = None
+        with suppress(HMAError, OSError):
+            if not seal_problem((folder / MANIFEST).read_bytes()):
+                known = Manifest.load(folder)
         if known:
             hashes = {shard.path: shard.sha256 for shard in known.shards}
             derived = derive(folder, list(hashes), known.embodiment, known.plan, known.source, hashes)
@@ -373,13 +374,6 @@ def restat(
             more = f", and {len(problems) - 1} more problems" if len(problems) > 1 else ""
             raise ShardError("", problems[0] + more)
         return derived.write(folder)
-
-
-def _whole_manifest(folder: Path) -> Manifest | None:
-    with suppress(HMAError, OSError):
-        if not seal_problem((folder / MANIFEST).read_bytes()):
-            return Manifest.load(folder)
-    return None
 
 
 def _as_found(folder: Path) -> Derived:

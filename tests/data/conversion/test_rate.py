@@ -225,7 +225,7 @@ def test_an_edited_target_hz_reaches_a_finished_set_and_its_shards_stay(toy_reco
     run(robot(1), toy_recording, out)
     before = shards(out)
     summary = run(robot(10), toy_recording, out)
-    assert summary.changed == "stride 10 → 1: the model now sees 10 Hz"
+    assert summary.changed == "new from the YAML: target_hz"
     assert (summary.made_shards, shards(out)) == (0, before)
     assert ShardSet(out).embodiment.stride == ShardSet(out).row_stride == 1
     run(robot(10), toy_recording, tmp_path / "anew")
@@ -240,7 +240,7 @@ def test_a_stated_stride_and_texts_are_told_too(toy_recording, tmp_path) -> None
     noted = run(robot(more="notes: wash the table first\n"), toy_recording, out)
     assert noted.changed == "new from the YAML: notes"
     other = run(robot(more="stride: 5\n"), toy_recording, out)
-    assert other.changed == "stride 2 → 5: the model now sees 2 Hz; also new from the YAML: notes"
+    assert other.changed == "new from the YAML: notes, stride"
     assert verify(out) == [] and ShardSet(out).embodiment.notes is None
 
 
@@ -266,7 +266,7 @@ def test_hma_convert_prints_the_new_stride_in_one_line(toy_recording, tmp_path) 
         (tmp_path / "toy_arm.yaml").write_text(robot(target_hz).to_yaml())
         done = hma(*args)
         lines = done.stdout.splitlines()
-        assert done.returncode == 0 and lines.count("stride 10 → 2: the model now sees 5 Hz") == said
+        assert done.returncode == 0 and lines.count("new from the YAML: target_hz") == said
 
 
 def test_rows_of_another_stride_are_refused_and_nothing_is_touched(toy_recording, tmp_path) -> None:
@@ -310,7 +310,7 @@ def test_shares_that_find_a_finished_set_bring_the_stride_once(toy_recording, tm
                 done.append(summary)
 
     at_once(work, range(3))
-    assert [item.changed for item in done if item.changed] == ["stride 10 → 2: the model now sees 5 Hz"]
+    assert [item.changed for item in done if item.changed] == ["new from the YAML: target_hz"]
     assert shards(out) == before and verify(out) == [] and ShardSet(out).embodiment.stride == 2
 
 
@@ -330,7 +330,7 @@ def test_an_extended_set_takes_the_stride_with_and_without_new_episodes(tmp_path
     run(robot(1), recording, out)
     write_toy(recording / "tuesday.hdf5", range(20, 26))
     extended = run(robot(5), recording, out, extend=True)
-    assert extended.made_shards and extended.changed.startswith("stride 10 → 2")
+    assert extended.made_shards and extended.changed == "new from the YAML: target_hz"
     before = shards(out)
-    assert run(robot(10), recording, out).changed.startswith("stride 2 → 1")
+    assert run(robot(10), recording, out).changed == "new from the YAML: target_hz"
     assert shards(out) == before and verify(out) == []

@@ -130,7 +130,7 @@ def test_one_folder_inside_the_other_is_refused_before_anything_is_written(out, 
 def test_a_file_in_place_of_the_dataset_is_refused_before_the_work(tmp_path: Path) -> None:
     data, robot = hdf5(tmp_path)
     before = contents(tmp_path)
-    with pytest.raises(OutputError, match="three.hdf5: is a file — choose an empty or new folder"):
+    with pytest.raises(OutputError, match="three.hdf5: holds something else — choose an empty or new folder"):
         convert(robot, str(data), "fsq-8", tmp_path / "shards", settings=BOTH, lerobot=data)
     assert contents(tmp_path) == before
 

@@ -68,7 +68,7 @@ def test_overwrite_starts_anew_and_foreign_files_are_never_touched(toy_arm, toy_
     run(toy_arm, toy_file, out, overwrite=True)
     assert files(out) == whole
     put_bytes(b"mine", out.with_name("other") / "notes.txt")
-    with pytest.raises(OutputError, match=r"is not a shard set: it holds notes\.txt"):
+    with pytest.raises(OutputError, match=r"holds what is not of a shard set: notes\.txt"):
         run(toy_arm, toy_file, out.with_name("other"), overwrite=True)
     assert files(out.with_name("other")) == {"notes.txt": b"mine"}
 
@@ -236,5 +236,5 @@ def test_a_card_beside_a_set_of_a_store_stays(toy_arm, toy_file, out, whole) -> 
     assert files(out) == whole | {"README.md": b"my notes"}
     assert verify(out) == []
     put_bytes(b"mine", out / "notes.txt")
-    with pytest.raises(OutputError, match=r"holds a file that is not of the set: notes\.txt — move it out"):
+    with pytest.raises(OutputError, match=r"holds what is not of a shard set: notes\.txt — move it out"):
         run(toy_arm, toy_file, out)
