@@ -76,9 +76,9 @@ class Episode:
         instruction: the instruction in words; empty when there is none.
         success: None when the recording does not say.
         source: the file or URI it comes from.
-        metadata: plain values worth keeping; `flags`, name -> count, are written to episodes.parquet and
-            added up in the summary of a conversion; `language`, what is said in words about moments of the
-            episode, is written there too, see `hma_data.sources.lerobot.language`.
+        metadata: `flags`, name -> count, are written to episodes.parquet and added up in the summary of a
+            conversion; `language`, what is said in words about moments of the episode, is written there too,
+            see `hma_data.sources.lerobot.language`. Other plain values are passed over.
     """
 
     id: str

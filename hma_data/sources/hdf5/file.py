@@ -152,11 +152,10 @@ def explained(where: object, error: type[HMAError] = EpisodeError) -> Iterator[N
 
 @dataclass(frozen=True)
 class EpisodeGroup:
-    """The place of an episode: a file and the group in it; or why the group cannot be read."""
+    """The place of an episode: a file and the group in it."""
 
     file: Path
     group: str = WHOLE_FILE
-    fault: tuple[str, ...] = ()  # and the remedy
 
     def __str__(self) -> str:
         return str(self.file) if self.group == WHOLE_FILE else f"{self.file}:{self.group}"
@@ -231,9 +230,12 @@ class EpisodeFinder:
 
     def group(self, place: EpisodeGroup) -> h5py.Group:
         """Return the episode's group, in the open file."""
-        if place.fault:
-            raise EpisodeError(place, *place.fault)
-        return member(self.files.get(place.file), place.group, str(place))
+        handle = self.files.get(place.file)
+        found = handle if place.group == WHOLE_FILE else inside(handle, place.group)
+        if found is None:
+            remedy = "copy the group into this file"
+            raise EpisodeError(place, "is damaged, or a link to what is not in this file", remedy)
+        return found
 
     def _inside(self, file: Path, pattern: str | None) -> dict[str, EpisodeGroup]:
         """Return the episodes of one file by name within it; the name of a whole file is empty."""
@@ -264,12 +266,11 @@ def _episodes(handle: h5py.File, file: Path, pattern: str | None) -> dict[str, E
     parts = pattern.split("/")
     fixed = next((i for i, part in enumerate(parts) if re.search(r"[*?\[]", part)), len(parts) - 1)
     found: dict[str, EpisodeGroup] = {}
-    matching = dict(_matching(handle, parts))
-    for group in sorted(matching, key=natural):
+    for group in sorted(_matching(handle, parts), key=natural):
         name = "/".join(map(_safe, group.split("/")[fixed:]))
         if name in found:
             raise SourceError(file, f"two of its groups give an episode called {name!r}", "rename one")
-        found[name] = EpisodeGroup(file, group, matching[group])
+        found[name] = EpisodeGroup(file, group)
     return found
 
 
@@ -361,26 +362,18 @@ def inside(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset | None:
     return item if item is not None and item.file.filename == group.file.filename else None
 
 
-def _matching(group: h5py.Group, parts: list[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Yield the paths of the groups that match a pattern, one part a level, and why one cannot be read."""
+def _matching(group: h5py.Group, parts: list[str]) -> Iterator[str]:
+    """Yield the paths of the groups that match a pattern, one part a level, and of links that lead away."""
     for name in group:
         if not fnmatchcase(name, parts[0]):
             continue
         item = inside(group, name)
         if item is None:
-            yield name, _why_not(group.get(name, getlink=True))
+            yield name
         elif isinstance(item, h5py.Group) and parts[1:]:
-            yield from ((f"{name}/{rest}", fault) for rest, fault in _matching(item, parts[1:]))
+            yield from (f"{name}/{rest}" for rest in _matching(item, parts[1:]))
         elif isinstance(item, h5py.Group):
-            yield name, ()
-
-
-def _why_not(link: Any) -> tuple[str, str]:
-    """Return why a member of a group cannot be read, and what helps."""
-    if not isinstance(link, h5py.SoftLink | h5py.ExternalLink):
-        return "cannot be read", "the file is damaged there: copy it again"
-    other = f"{link.filename}:" if isinstance(link, h5py.ExternalLink) else ""
-    return f"is a link to {other}{link.path}, which is not in this file", "copy the group into this file"
+            yield name
 
 
 def _safe(name: str) -> str:
@@ -412,17 +405,16 @@ def dataset(group: h5py.Group, key: str, where: str) -> h5py.Dataset:
         EpisodeError: see `member`; or it is a group, a single value, empty, or of a size no recording has.
     """
     found = member(group, key, where)
-    if isinstance(found, h5py.Group):
-        inner = ", ".join(f"{key.strip('/')}/{name}" for name in list(found)[:8])
-        raise EpisodeError(where, f"{key!r} is a group, not a dataset", f"it holds: {inner or 'nothing'}")
     if not isinstance(found, h5py.Dataset):
-        raise EpisodeError(where, f"{key!r} is a named type, not a dataset")
+        members = list(found)[:8] if isinstance(found, h5py.Group) else ()
+        inner = ", ".join(f"{key.strip('/')}/{name}" for name in members)
+        raise EpisodeError(
+            where, f"{key!r} is a group or a type, not a dataset", f"it holds: {inner or 'nothing'}"
+        )
     if is_elsewhere(found, group):
         raise EpisodeError(where, f"{key!r} keeps its values in other files", "write them into this one")
-    if not found.shape:
-        raise EpisodeError(where, f"{key!r} is a single value, not one value per frame")
-    if not found.shape[0]:
-        raise EpisodeError(where, f"{key!r} is empty")
+    if not found.shape or not found.shape[0]:
+        raise EpisodeError(where, f"{key!r} holds no rows, one per frame (shape {found.shape})")
     if not is_plausible(found):
         raise EpisodeError(
             where, f"{key!r} has shape {found.shape} in chunks {found.chunks}, too large to read"

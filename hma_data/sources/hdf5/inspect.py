@@ -3,7 +3,6 @@
 import re
 from collections import Counter
 from collections.abc import Container, Iterator
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -13,7 +12,7 @@ import numpy as np
 
 from hma_data.arrays import Array
 from hma_data.episodes.images import decode_image, image_codec
-from hma_data.errors import EpisodeError, HMAError
+from hma_data.errors import EpisodeError
 from hma_data.registry.components import Hdf5Layout
 from hma_data.sources.common import checks
 from hma_data.sources.common.checks import Finding, is_times, seconds_a_unit
@@ -32,7 +31,6 @@ from hma_data.sources.hdf5.file import (
     is_plausible,
     is_single,
     json_of,
-    masks_of,
     numbers,
     rows,
     text,
@@ -46,7 +44,7 @@ MAX_HZ = 1e6
 _ENDS = ("episode_ends", "episode_lengths", "terminals", "timeouts", "dones")  # of episodes end to end
 _BESIDE = ("compress_len",)  # not rows over time: the bytes of ALOHA's JPEGs, (cameras, T)
 _MEASURED = "measured from"
-_SIMULATORS = {1: "robosuite", 2: "gym", 3: "iGibson"}  # robomimic's env_args.type
+SIMULATORS = (1, 2, 3)  # robomimic's env_args.type: robosuite, gym, iGibson
 
 
 @dataclass(frozen=True)
@@ -103,15 +101,6 @@ def inspect(uri: str, finder: EpisodeFinder, episodes: int, pattern: str | None 
                 measured = first.facts["rate"].startswith(_MEASURED)
                 source = f"{first.name} at" if measured else "the recording states"
                 survey.look(name, keys, first.rate, source)
-    for file in {found[name].file for name in chosen}:
-        masks: dict[str, set[str]] = {}
-        with suppress(HMAError), explained(file):  # what a damaged file lacks is told of its episodes
-            masks = masks_of(finder.files.get(file))
-        demos = {place.group.rsplit("/", 1)[-1] for place in found.values() if place.file == file}
-        for mask, names in masks.items():
-            if absent := sorted(names - demos):
-                said = f"mask/{mask} names {listed(absent)}, which {file.name} does not have"
-                survey.note(Finding("keys", "warn", said, numbers={"demos": len(absent)}))
     lacking = [key for key, count in held.items() if key not in first.keys and 2 * count >= len(lengths)]
     if lacking:
         survey.note(Finding("keys", "warn", f"{first.name}: has no {listed(lacking)}, which others have"))
@@ -203,17 +192,16 @@ def _length(sizes: dict[str, int]) -> int:
 def _facts(group: h5py.Group, said: dict[str, Any], place: EpisodeGroup) -> dict[str, str]:
     """Return facts about the recording: simulator, layout, and the key of the instruction."""
     data = group.file.get("data")
-    simulated = [group.attrs.get("sim"), group.file.attrs.get("sim")]
-    simulator = ""
-    if any(isinstance(value, bool | np.bool_) and value for value in simulated):
-        simulator = "the attribute sim"
-    elif isinstance(kind := said.get("type"), int) and kind in _SIMULATORS:
-        simulator = f"{_SIMULATORS[kind]}, by env_args"
-    elif "model_file" in group.attrs or (isinstance(data, h5py.Group) and "env_info" in data.attrs):
-        simulator = "robosuite, by its attributes"
+    stated = [holder.attrs.get("sim") for holder in (group, group.file)]
+    simulated = (
+        any(isinstance(value, bool | np.bool_) and value for value in stated)
+        or said.get("type") in SIMULATORS
+        or "model_file" in group.attrs
+        or (isinstance(data, h5py.Group) and "env_info" in data.attrs)
+    )
     return {
         "environment": str(said.get("env_name") or ""),
-        "simulator": simulator,
+        "simulator": "yes, by its attributes" if simulated else "",
         "layout": "one file an episode" if place.group == WHOLE_FILE else "",
         "instruction": next((name for name in TEXT_KEYS if text(group.attrs.get(name))), ""),
     }

@@ -21,7 +21,6 @@ T frames of an episode, n of them asked for, H×W pixels, C channels.
 """
 
 from functools import partial
-from typing import Any
 
 import h5py
 import numpy as np
@@ -169,7 +168,7 @@ class Hdf5Source:
                 instruction=_instruction(group, embodiment.source.instruction, where),
                 success=_success(group),
                 source=where,
-                metadata=_metadata(group) | ({"flags": {"rows_without_record": unused}} if unused else {}),
+                metadata={"flags": {"rows_without_record": unused}},
             )
 
     def _images(
@@ -263,18 +262,14 @@ def _instruction(group: h5py.Group, key: str | None, where: str) -> str:
         return _first_text(found)
     for holder in (group, group.parent, group.file):
         for name in TEXT_KEYS:
-            if said := text(holder.attrs.get(name)) or _single_text(inside(holder, name), group):
+            item = inside(holder, name)
+            if said := text(holder.attrs.get(name)) or (_first_text(item) if is_single(item, group) else ""):
                 return said
         for name, inner in TEXTS_IN_JSON:
             stated = json_of(holder, name).get(inner, "")
             if said := text("".join(map(str, stated)) if isinstance(stated, list) else stated):
                 return said
     return ""
-
-
-def _single_text(found: Any, group: h5py.Group) -> str:
-    """Return the text of a dataset of one value; empty where it is something else."""
-    return _first_text(found) if is_single(found, group) else ""
 
 
 def _first_text(found: h5py.Dataset) -> str:
@@ -301,13 +296,3 @@ def _success(group: h5py.Group) -> bool | None:
             values = found[()]
             return bool(values[-1]) if np.isin(values, (0, 1)).all() else None
     return None
-
-
-def _metadata(group: h5py.Group) -> dict[str, Any]:
-    """Return short plain attributes of the episode; leave out models and other long texts."""
-    found: dict[str, Any] = {}
-    for name, value in group.attrs.items():
-        plain = value.item() if isinstance(value, np.generic) else value
-        if isinstance(plain, bool | int | float) or (isinstance(plain, str) and 0 < len(plain) <= 200):
-            found[name] = plain
-    return found

@@ -19,7 +19,6 @@ import hashlib
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -123,9 +122,6 @@ class LeRobotSource:
             streams[camera.name] = FilmRows(file, times, found)
             if unused := fit_of(meta, camera.key, file, span).unused.get(index):
                 flags[f"{UNUSED}:{camera.name}"] = unused
-        metadata: dict[str, Any] = {"flags": flags, "language": language_of(meta, rows, times)}
-        if len(tasks) > 1:
-            metadata["tasks"] = tasks
         read = partial(read_vector, read=rows.numbers, where=str(rows.path))
         return Episode(
             id=episode_id,
@@ -135,7 +131,7 @@ class LeRobotSource:
             instruction=_instruction(meta, rows, embodiment.source.instruction, tasks),
             success=_success(rows),
             source=str(rows.path),
-            metadata=metadata,
+            metadata={"flags": flags, "language": language_of(meta, rows, times)},
         )
 
     def _open(self, uri: str, again: bool = False) -> Metadata:

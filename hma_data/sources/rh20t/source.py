@@ -52,7 +52,6 @@ MAX_WIDTH = 4096  # values of a sample
 SUCCESS_RATING = 2  # the lowest rating of a task that was done
 MAX_STAMP = 1 << 53  # milliseconds: below it, float64 holds every whole number
 STAMP_BYTES = 16  # of timestamps.npy for a frame, of colour and of depth, about
-_METADATA_KEYS = ("rating", "calib_quality", "finish_time", "calib")
 
 
 def scenes(uri: str) -> dict[str, Path]:
@@ -298,13 +297,9 @@ class Rh20tSource:
                 as_text(uri), f"has no scene {episode_id!r}", f"it has {len(found)}: {known}, …"
             )
         scene = Scene(found[episode_id])
-        flags: dict[str, int] = {}
         streams = {camera.name: Film(scene, camera.key) for camera in embodiment.cameras}
-        if lacking := sum(film.lacking for film in streams.values()):
-            flags["frames_missing"] = lacking
         primary = embodiment.primary_camera.key
-        said = scene.metadata()
-        rating = said.get("rating")
+        rating = scene.metadata().get("rating")
         return Episode(
             id=episode_id,
             streams={**streams},
@@ -314,10 +309,7 @@ class Rh20tSource:
             instruction=scene.task(embodiment.source.instruction or INSTRUCTION_FIELD),
             success=rating >= SUCCESS_RATING if isinstance(rating, int) else None,
             source=str(scene.folder),
-            metadata={
-                "flags": flags,
-                **{key: said[key] for key in _METADATA_KEYS if _is_plain(said.get(key))},
-            },
+            metadata={"flags": {"frames_missing": sum(film.lacking for film in streams.values())}},
         )
 
     def _list(self, uri: str) -> dict[str, Path]:
@@ -334,10 +326,6 @@ def _signals(scene: Scene, vector: Vector, camera: str) -> tuple[Signal, ...]:
         times, values = scene.series(part.key, camera)
         found.append(Signal(times, component_values(part, values, str(scene.folder))))
     return tuple(found)
-
-
-def _is_plain(value: Any) -> bool:
-    return isinstance(value, int | float | str) and len(str(value)) <= 200
 
 
 def _estimate(folder: Path, embodiment: Embodiment | None) -> int:

@@ -13,7 +13,6 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -107,7 +106,7 @@ class RldsSource:
             instruction=_instruction(folder, steps, embodiment.source.instruction),
             success=_success(folder, steps),
             source=path,
-            metadata=_metadata(folder, example) | ({"flags": {"padded_steps": 1}} if padded else {}),
+            metadata={"flags": {"padded_steps": int(padded)}},
         )
 
     def expect(self, uri: StrPath, episode_ids: Sequence[str]) -> None:
@@ -317,15 +316,6 @@ def _success(folder: RldsFolder, steps: Steps) -> bool | None:
     rewards, ends = (steps.numbers(key).reshape(steps.count, -1) for key in ("reward", "is_terminal"))
     sparse = rewards.shape[1] == 1 and np.isin(rewards, (0, 1)).all()
     return True if sparse and rewards[-1] and ends[-1].all() else None
-
-
-def _metadata(folder: RldsFolder, example: Example) -> dict[str, Any]:
-    found = {
-        name.removeprefix("episode_metadata/"): scalar(example, feature)
-        for name, feature in folder.features.items()
-        if not name.startswith("steps/")
-    }
-    return {name: value for name, value in found.items() if value is not None}
 
 
 # -- inspection

@@ -94,7 +94,6 @@ def test_an_episode_is_read_as_it_was_written(tmp_path):
     np.testing.assert_allclose(episode.actions[0].timestamps, np.arange(5) / 5)
     np.testing.assert_array_equal(episode.streams["primary"].frames([3, 0]), pictures(2, 5)[[3, 0]])
     assert (episode.instruction, episode.success) == ("lift é 2", True)
-    assert episode.metadata == {"file_path": "/robot/2"}
     assert len(to_clip(episode, embodiment())) == 5
 
 
@@ -495,7 +494,6 @@ def test_the_real_bridge_recording_equals_an_independent_parse(real_data):
         np.testing.assert_array_equal(episode.actions[0].values, action)
         np.testing.assert_array_equal(episode.states[0].values, state)
         assert episode.instruction.encode() == truth["steps/language_instruction"].bytes_list.value[0]
-        assert episode.metadata["episode_id"] == truth["episode_metadata/episode_id"].int64_list.value[0]
         last = len(action) - 1
         jpeg = truth["steps/observation/image_0"].bytes_list.value[last]
         shown = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]

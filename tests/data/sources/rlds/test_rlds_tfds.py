@@ -170,12 +170,10 @@ def robot(instruction: str | None = None) -> Embodiment:
     return Embodiment.from_values(ROBOT | {"source": source}, "toy.yaml")
 
 
-def test_an_episode_has_their_metadata_instruction_and_success(written, truth):
+def test_an_episode_has_their_instruction_and_success(written, truth):
     for name, episode in each(truth):
         found = RLDS.read(str(written), name, robot("words"))
-        expected = {key: value.numpy() for key, value in episode["episode_metadata"].items()}
-        assert found.metadata == expected | {"file": expected["file"].decode()}
-        assert found.success is bool(expected["success"])
+        assert found.success is bool(episode["episode_metadata"]["success"].numpy())
         assert found.instruction.encode() == episode["steps"][0]["words"].numpy()
         assert RLDS.read(str(written), name, robot("synonyms")).instruction == "push it"
         columns = [step["numbers"]["float64_zlib_1"].numpy() for step in episode["steps"]]
