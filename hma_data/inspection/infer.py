@@ -341,7 +341,9 @@ class _Draft:
             "actions": "hold",
             "states": "interpolate",
         }
-        tolerance = infer_topics.tolerance_ms(self.offsets.values())
+        # with it, `hold` gives frames their actions
+        stated = (one.tolerance_ms for one in self.offsets.values() if one.tolerance_ms)
+        tolerance = min(stated, default=None)
         skew = infer_topics.max_skew_ms(self.seen.keys[1:], self.action.keys, self.states)
         sync |= {"tolerance_ms": tolerance} if tolerance else {}
         sync |= {"max_skew_ms": skew} if skew else {}
@@ -365,11 +367,8 @@ class _Draft:
             said["stride" if self._short_at_any_rate() else "target_hz"] = (
                 f"so that a model sees {FRAMES_PER_EPISODE} frames of an episode of {length}, if it has them"
             )
-        names = {topic.name for topic in infer_topics.about(self.used)}
-        mixed = [one.message for one in self.found.findings if one.check == "keys" and one.key in names]
-        asked = [self.action.question, *(f"{one}; is it the right one?" for one in mixed)]
-        if asked := [one for one in asked if one]:
-            said["action"] = f"{TODO}: {' '.join(asked)}"
+        if self.action.question:
+            said["action"] = f"{TODO}: {self.action.question}"
         if padded := [one.message for one in self.found.findings if one.check == "padding"]:
             said["last_step"] = "; ".join(padded)
         if self.seen.question or self.looks:

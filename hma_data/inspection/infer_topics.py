@@ -4,6 +4,7 @@ import re
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from operator import itemgetter
 
 from hma_data.episodes.offset import Offset
 from hma_data.inspection.infer_choices import (
@@ -50,7 +51,7 @@ def runs(key: KeyInfo) -> bool:
 def commanding_topics(found: list[KeyInfo]) -> Choice:
     """Choose the topics that drive the robot: the clearest, its twin of the other arm, and grippers."""
     ranked = [(_rank(topic), topic) for topic in _topics(found)]
-    commanding = sorted((pair for pair in ranked if pair[0][0] > 0), key=_order, reverse=True)
+    commanding = sorted((pair for pair in ranked if pair[0][0] > 0), key=itemgetter(0), reverse=True)
     if not commanding:
         return Choice()
     best = commanding[0][1]
@@ -69,7 +70,7 @@ def commanding_topics(found: list[KeyInfo]) -> Choice:
     if still:
         asked.append(f"{still} never changes in the sampled bag and is left out; does it change in others?")
     others = [topic[0] for _, topic in commanding if topic not in chosen]
-    (clear, ticks, *_), _ = commanding[0]
+    (clear, _, ticks, *_), _ = commanding[0]
     if clear <= WEAK or not ticks:
         others += [key for key in found if key not in keys and key not in others]
     if others or clear <= WEAK or not ticks:
@@ -99,8 +100,11 @@ def _path(key: KeyInfo) -> str:
     return key.key[len(key.topic.name) :] if key.topic else key.key
 
 
-def _rank(topic: Topic) -> tuple[int, bool, float, int]:
-    """Return (strength as an action, whether its rate is known, rate, messages); strength 0: no action."""
+def _rank(topic: Topic) -> tuple[int, bool, bool, float, int]:
+    """Return (strength as an action, whether it is an arm's, whether its rate is known, rate, messages).
+
+    Strength 0 is no action. Of equally strong topics, a gripper is behind its arm.
+    """
     said, first = set(words(_name(topic))), topic[0]
     inside = {word for key in topic for word in words(_path(key))}
     clear = strength(said)
@@ -110,13 +114,8 @@ def _rank(topic: Topic) -> tuple[int, bool, float, int]:
         clear = max(clear, 4)
     elif _COMMAND_TYPE.search(first.topic.type if first.topic else "") and not said & MEASURED:
         clear = max(clear, 2)
-    return clear, first.hz is not None, first.hz or 0.0, first.count or 0
-
-
-def _order(pair: tuple[tuple[int, bool, float, int], Topic]) -> tuple[float, ...]:
-    """Return the order of a topic with its rank; of equally strong ones, a gripper is behind its arm."""
-    (clear, *others), topic = pair
-    return (clear, not is_gripper(_name(topic)), *others)
+    is_arm = not is_gripper(_name(topic))
+    return clear, is_arm, first.hz is not None, first.hz or 0.0, first.count or 0
 
 
 def _other_side(topic: Topic, best: Topic) -> bool:
@@ -212,11 +211,6 @@ def told(found: dict[str, Offset]) -> list[str]:
     if len(set(lines.values())) == 1:
         return [*lines.values()][:1]
     return [f"{name}: {line}" for name, line in lines.items()]
-
-
-def tolerance_ms(found: Iterable[Offset]) -> float | None:
-    """Return the tolerance with which `hold` gives frames their actions; None where none is needed."""
-    return min((one.tolerance_ms for one in found if one.tolerance_ms), default=None)
 
 
 def max_skew_ms(

@@ -32,7 +32,7 @@ from hma_data.sources.bags.container import (
 from hma_data.sources.bags.mcap import MAGIC as MCAP_MAGIC
 from hma_data.sources.bags.mcap import McapFile
 from hma_data.sources.bags.ros_files import SQLITE_MAGIC, Ros1File, SqliteFile
-from hma_data.sources.common.places import file_fingerprint, first_bytes, require_inside
+from hma_data.sources.common.places import file_fingerprint, first_bytes, natural, require_inside
 from hma_data.storage.fetch import mark
 from hma_data.storage.remote import RemotePath, is_remote
 from hma_data.storage.yaml_io import read_yaml
@@ -244,8 +244,6 @@ def _container(path: Path, chunks: Chunks) -> Container:
         return McapFile(path, chunks)
     if magic.startswith(SQLITE_MAGIC):
         return SqliteFile(path)
-    if not magic:
-        raise damaged(path, "is empty")
     raise damaged(
         path, f"begins with {magic[:8]!r}, which is not how a ROS 1 bag, MCAP or sqlite3 file begins"
     )
@@ -290,7 +288,7 @@ def _listed(folder: Path, metadata: dict[str, Any]) -> tuple[list[Path], tuple[s
     remarks = []
     if parts:
         remarks.append(f"{where} names {len(paths)} of its {len(paths) + len(parts)} files: all are read")
-        paths = sorted([*paths, *parts], key=lambda path: _part_number(path) or 0)
+        paths = sorted([*paths, *parts], key=lambda path: natural(path.name))
     if left_out:
         remarks.append(f"{where} does not name {', '.join(left_out[:3])}: left out ({len(left_out)} in all)")
     return paths, tuple(remarks)
@@ -306,9 +304,7 @@ def _named_file(folder: Path, name: str, where: Path) -> Path:
     if not path.is_file() and packed.is_file():
         return packed
     if not path.is_file():
-        remedy = "copy it in, or run ros2 bag reindex to leave it out"
-        if any(item.suffix == ".zstd" for item in folder.iterdir()):  # reindex cannot open packed files
-            remedy = "copy it in, or remove it from relative_file_paths"
+        remedy = "copy it in, or remove it from relative_file_paths"
         raise EpisodeError(where, f"names {name}, which is not in the folder", remedy)
     return path
 
@@ -320,11 +316,6 @@ SPLIT_PART = re.compile(
 )
 MAX_PAUSE_NS = 10**9  # between two parts of one recording; episodes that are recorded apart pause longer
 MAX_OVERLAP_NS = 10**8
-
-
-def _part_number(path: Path) -> int | None:
-    match = SPLIT_PART.fullmatch(path.name)
-    return int(match["number"]) if match else None
 
 
 def _split_stem(path: Path) -> tuple[str, str] | None:

@@ -157,23 +157,18 @@ class MessageTimes:
 
     def set_back_error(self, clock: str, where: str) -> EpisodeError:
         """Return the error of a clock that was set back; its remedy makes no data worse."""
-        by_header = clock == "header" and self.stamps is not None
+        own, other = "header stamps", "receive"
+        if clock != "header" or self.stamps is None:
+            own, other = "receive times", "header"
         steps = np.diff(self.by(clock))
         at = int(np.argmin(steps)) + 1
         seconds = -float(steps[at - 1]) / SECOND_NS
-        usable = self.stamps is not None and self.order("receive" if by_header else "header") is not None
+        fault = f"{own} go back by {seconds:.3g} s at message {at}: their clock was set back or begun anew"
         remedy = "cut the file there, and put the parts into separate folders"
-        if by_header:
-            fault = f"header stamps go back by {seconds:.3g} s at message {at}: their clock was set back"
-            fault += ", or a simulation was restarted"
-            if usable:
-                remedy = "sync: {stamp: receive} uses receive times instead"
-                if seconds > 1:  # segments divide where a clock jumps back as far as they state
-                    remedy = f"source.segments: {{gap_s: 1}} makes the parts episodes of their own; {remedy}"
-        else:
-            fault = f"receive times go back by {seconds:.3g} s at message {at}: "
-            fault += "the recorder's clock was set back"
-            remedy = "sync: {stamp: header} uses the header stamps, which are in order" if usable else remedy
+        if self.stamps is not None and self.order(other) is not None:
+            remedy = f"sync: {{stamp: {other}}} uses the other times of the messages"
+            if other == "receive" and seconds > 1:  # segments divide where a clock jumps back so far
+                remedy = f"source.segments: {{gap_s: 1}} makes the parts episodes of their own; {remedy}"
         return EpisodeError(where, fault, remedy)
 
     def clock(self, clock: str = "header") -> Clock:

@@ -78,11 +78,16 @@ def codec(message: Any, kind: str) -> str:
     """Return how the image, which is no video, is stored: jpeg, png, raw …"""
     if kind == RAW:
         return "raw"
-    stated = str(child(message, "format")).lower() if "format" in field_names(message) else ""
-    for name in ("jpeg", "png", "webp", "avif"):
-        if name in stated.replace("jpg", "jpeg"):
-            return name
-    return stated
+    stated = _stated(message)
+    return next(
+        (name for name in ("jpeg", "png", "webp", "avif") if name in stated.replace("jpg", "jpeg")), stated
+    )
+
+
+def _stated(message: Any) -> str:
+    """Return in lower case how a message says that its image is stored, in `format` or `encoding`."""
+    names = [name for name in ("format", "encoding") if name in field_names(message)]
+    return str(child(message, names[0])).lower() if names else ""
 
 
 def video_codec(message: Any) -> str:
@@ -98,8 +103,7 @@ def video_codec(message: Any) -> str:
             return "h265"
         if head[0] & 0x1F in (7, 9):  # a parameter set, or the delimiter before it
             return "h264"
-    name = "format" if "format" in field_names(message) else "encoding"
-    stated = str(child(message, name)).lower()
+    stated = _stated(message)
     known = next((codec for word, codec in ENCODERS if word in stated), "")
     return known or stated.partition(";")[0]
 
@@ -109,12 +113,8 @@ def encoding(message: Any, kind: str) -> str:
 
     image_transport begins the format of compressed images with it: "mono8; jpeg compressed".
     """
-    if kind == RAW:
-        return str(child(message, "encoding")).lower()
-    if kind != STILL_IMAGE:
-        return ""
-    before, separator, _ = str(child(message, "format")).lower().partition(";")
-    return before if separator else ""
+    before, separator, _ = _stated(message).partition(";")
+    return before if kind == RAW or (separator and kind == STILL_IMAGE) else ""
 
 
 def picture(message: Any, kind: str, where: str, levels: Levels | None = None, least: int = 0) -> Images:
@@ -129,8 +129,8 @@ def picture(message: Any, kind: str, where: str, levels: Levels | None = None, l
             or it is grey of 16 bits and there are no levels.
     """
     try:
-        if kind == STILL_IMAGE and any(name in str(child(message, "format")).lower() for name in DEPTH):
-            stated = str(child(message, "format"))
+        stated = _stated(message)
+        if kind == STILL_IMAGE and any(name in stated for name in DEPTH):
             raise EpisodeError(where, f"{stated!r} is depth, not colour", "name a colour topic as camera")
         if encoding(message, kind) == MONO16 and (kind == RAW or image_codec(payload(message)) == "png"):
             if levels is None:
@@ -151,8 +151,7 @@ def picture(message: Any, kind: str, where: str, levels: Levels | None = None, l
 
 def _mosaic(message: Any) -> str:
     """Return the Bayer encoding that a compressed image states, such as bayer_rggb8; empty without one."""
-    stated = str(child(message, "format")).lower() if "format" in field_names(message) else ""
-    found = re.search(r"bayer_\w+", stated)
+    found = re.search(r"bayer_\w+", _stated(message))
     return found[0] if found else ""
 
 
@@ -185,7 +184,7 @@ def wide_grey(message: Any, kind: str, where: str) -> NDArray[np.uint16]:
     if kind == RAW:
         low_first = "is_bigendian" not in field_names(message) or not child(message, "is_bigendian")
         pixels = _pixels(message, where, pixel=2)
-        return np.ascontiguousarray(pixels).view("<u2" if low_first else ">u2")[..., 0].astype(np.uint16)
+        return pixels.view("<u2" if low_first else ">u2")[..., 0].astype(np.uint16)
     cv2 = opencv()
     found = cv2.imdecode(np.frombuffer(payload(message), np.uint8), cv2.IMREAD_UNCHANGED)
     if found is None or found.ndim != 2:
@@ -202,14 +201,14 @@ def payload(message: Any) -> bytes:
 
 
 def _raw(message: Any, where: str) -> Images:
-    stated = str(child(message, "encoding"))
-    if stated.lower() not in ENCODINGS:
+    stated = _stated(message)
+    if stated not in ENCODINGS:
         raise EpisodeError(
             where,
             f"images in {stated!r} are not 8-bit colour",
             f"these can be read: {', '.join([*ENCODINGS, MONO16])}",
         )
-    pixel, conversion = ENCODINGS[stated.lower()]
+    pixel, conversion = ENCODINGS[stated]
     pixels = _pixels(message, where, pixel)
     cv2 = opencv()
     return cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{conversion}")) if conversion else pixels
@@ -217,19 +216,18 @@ def _raw(message: Any, where: str) -> Images:
 
 def _pixels(message: Any, where: str, pixel: int) -> Images:
     """Return the bytes (H, W, pixel) of a raw image without the padding of its rows."""
-    stated = str(child(message, "encoding"))
+    stated = _stated(message)
     height, width, step = (int(child(message, name)) for name in ("height", "width", "step"))
     if min(height, width) < 1 or height * width > MAX_PIXELS:
         raise EpisodeError(where, f"an image claims {width}×{height} pixels, the maximum is {MAX_PIXELS:,}")
-    planar = stated.lower() in ("nv12", "nv21")  # rows of colour, half as many, follow those of luma
+    planar = stated in ("nv12", "nv21")  # rows of colour, half as many, follow those of luma
     rows, row = height * 3 // 2 if planar else height, width * pixel
     step = step or row
     data = child(message, "data")
     flat = data if isinstance(data, np.ndarray) else np.frombuffer(payload(message), np.uint8)
-    shared = planar or (pixel == 2 and stated.lower() != MONO16)  # two pixels of YUV share their colour
-    if (shared and width % 2) or (planar and height % 2):
-        raise EpisodeError(where, f"an image of {width}×{height} in {stated} does not have even sides")
-    if step < row or len(flat) < step * (rows - 1) + row:
+    shared = planar or (pixel == 2 and stated != MONO16)  # two pixels of YUV share their colour
+    uneven = (shared and width % 2) or (planar and height % 2)
+    if uneven or step < row or len(flat) < step * (rows - 1) + row:
         raise EpisodeError(
             where, f"an image of {width}×{height} in {stated} has {len(flat):,} bytes, rows of {step}"
         )
@@ -242,15 +240,13 @@ def _pixels(message: Any, where: str, pixel: int) -> Images:
 # -- video
 
 
-def is_keyframe(data: bytes, codec: str) -> bool | None:
-    """Check whether decoding can begin at a message; None for a codec that is not parsed."""
+def is_keyframe(data: bytes, codec: str) -> bool:
+    """Check whether decoding can begin at a message; the codec is one of CODECS."""
     if codec == "h264":
         return any(unit[1][0] & 0x1F == 5 for unit in NAL_UNIT.finditer(data))
     if codec == "h265":
         return any(16 <= (unit[1][0] >> 1) & 0x3F <= 21 for unit in NAL_UNIT.finditer(data))
-    if codec == "vp9":
-        return _vp9_begins(data)
-    return _av1_begins(data) if codec == "av1" else None
+    return _vp9_begins(data) if codec == "vp9" else _av1_begins(data)
 
 
 def has_b_slices(data: bytes) -> bool:
@@ -323,9 +319,6 @@ class VideoDecoder:
         where: the episode and topic, for the error.
         reorders: whether frames are shown in another order than their messages come. Then indices count
             frames as they are shown: nothing after a key frame is shown before what comes before it.
-
-    Raises:
-        EpisodeError: the codec is not one of these.
     """
 
     def __init__(
@@ -336,8 +329,6 @@ class VideoDecoder:
         where: str,
         reorders: bool = False,
     ) -> None:
-        if codec not in CODECS:
-            raise EpisodeError(where, f"video in {codec!r} cannot be read", f"these can: {', '.join(CODECS)}")
         self._codec, self._keyframes, self._fetch, self._where = codec, keyframes, fetch, where
         self._reorders = reorders
         self._group, self._shown = 0, 0  # the key frame of the frames last shown; how many were shown since

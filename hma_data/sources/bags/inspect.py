@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from hma_data.arrays import Floats
+from hma_data.arrays import Bools, Floats, Ints
 from hma_data.episodes.offset import measure as measure_offset
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.sources.bags.bag import Bag
@@ -95,16 +95,12 @@ class _Topic:
     named: int = 0
     fault: EpisodeError | None = None
     values: list[_Values] = field(default_factory=list)
-    others: dict[str, Any] = field(default_factory=dict)  # by type, first messages of other types
 
-    def look_at(self, message: Any, where: str, kind: str) -> None:
+    def look_at(self, message: Any, where: str) -> None:
         """Add a message's values, and keep it as the sample where it names more joints.
 
         Two publishers of one JointState topic may name different joints.
         """
-        if kind != self.track.channels[0].type:
-            self.others.setdefault(kind, message)
-            return
         named = child(message, "name") if "name" in field_names(message) else ""
         count = len(named) if is_list(named) else 0
         first = self.sample is None
@@ -182,8 +178,7 @@ def report(uri: str, root: Path, bags: dict[str, list[Path]], episodes: int) -> 
     if first is None:
         faults = [one for one in survey.findings(()) if one.severity != "info"]
         told, remedy = (faults[0].message, faults[0].remedy) if faults else ("no bag holds a message", "")
-        own = told.removeprefix(f"{uri}: ")
-        raise SourceError(uri, own if own != told else f"nothing to inspect: {told}", remedy)
+        raise SourceError(uri, f"nothing to inspect: {told.removeprefix(f'{uri}: ')}", remedy)
     keys = _with_offsets(first.keys, clocks, survey)
     camera = next((key for key in keys if key.kind == "camera"), None)
     frames = [counts[camera.key] for counts in lengths] if camera else []
@@ -252,7 +247,7 @@ class _BagInspection:
                 message = None if topic.fault else decode(record.channel, record.data, where)
                 topic.track.add(record.channel, record.log_ns, place, message)
                 if message is not None:
-                    topic.look_at(message, where, record.channel.type)
+                    topic.look_at(message, where)
                 for value in topic.values:
                     if len(value.held) > MAX_HELD:
                         value.hand_on(self._survey, self._name)
@@ -273,13 +268,6 @@ class _BagInspection:
         found: list[KeyInfo] = []
         if not topic.fault:
             found = [self._camera(topic, kind)] if kind else _values(name, topic.sample)
-            known = {key.key for key in found}
-            for other in topic.others.values():
-                found += [key for key in _values(name, other) if key.key not in known]
-        if topic.others:
-            types = " and ".join(sorted([stated.type, *topic.others]))
-            said = f"{name} carries {types}; a key reads the messages that have its field"
-            self._survey.note(Finding("keys", "warn", said, key=name))
         found = found or [KeyInfo(name, "other", (), stated.type or stated.encoding)]
         for value in topic.values:
             value.hand_on(self._survey, self._name)
@@ -296,9 +284,6 @@ class _BagInspection:
             self._survey.note(Finding("stamps", "warn", said, key=track.topic, numbers={"seconds": apart}))
         if times.order("header") is None:
             remedy = times.set_back_error("header", str(self.bag.path)).remedy
-        elif late := 0 if times.stamps is None else int(np.sum(np.diff(times.stamps) < 0)):
-            said = f"{track.topic}: {late} messages arrived out of order; their header stamps order them"
-            self._survey.note(Finding("back", "info", said, key=track.topic, numbers={"count": late}))
         self._survey.times(self._name, track.topic, self.clocks[track.topic].header, camera, remedy)
 
     def _camera(self, topic: _Topic, kind: str) -> KeyInfo:
@@ -307,8 +292,8 @@ class _BagInspection:
         high = None
         try:
             stream = camera_stream(self.bag, track, "stored", levels=ALL_LEVELS)
-            keyframes = track.keyframes() if kind == VIDEO else None
-            indices = checks.choose(len(stream.timestamps), PAIRS, _starts(keyframes))
+            starts = _starts(track.keyframes()) if kind == VIDEO else None
+            indices = checks.choose(len(stream.timestamps), PAIRS, starts)
             for run in checks.runs(indices):
                 frames = stream.frames(run)
                 self._survey.pictures(self._name, name, frames, run, stored)
@@ -387,10 +372,8 @@ def _gap_ms(times: Floats, seen: list[Floats]) -> float | None:
     return float(intervals.max() * 1e3)
 
 
-def _starts(keyframes: Any) -> Any:
-    """Return for each frame the keyframe before it, counted from the first; None where it is unknown."""
-    if keyframes is None or not keyframes.any():
-        return None
+def _starts(keyframes: Bools) -> Ints:
+    """Return for each frame the keyframe before it, counted from the first."""
     shown = keyframes[int(np.argmax(keyframes)) :]
     return np.maximum.accumulate(np.where(shown, np.arange(len(shown)), 0))
 

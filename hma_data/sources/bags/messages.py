@@ -17,11 +17,12 @@ import numpy as np
 from hma_data.errors import EpisodeError
 from hma_data.sources.bags.clocks import DAY_S, SECOND_NS
 from hma_data.sources.bags.container import Channel, Data
+from hma_data.storage.kinds import one_line
 
 Decode = Callable[[Data], Any]
 IDL_SEPARATOR = "=" * 80 + "\n"
 TIME_FIELDS = (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos"))
-PLAIN_CDR, PARAMETERS = 1, (2, 3)  # RTPS's kinds of encapsulation: 0 and 1 are plain CDR; lists in XCDR1
+PLAIN_CDR = 1  # the last of RTPS's kinds of encapsulation that is plain; then parameter lists and XCDR2
 WELL_KNOWN = "google/protobuf/"
 UNITS_NS = (1, 10**3, 10**6, 10**9)
 LATEST = 2.0**63  # nanoseconds since 1970
@@ -36,23 +37,14 @@ def decode(channel: Channel, data: Data, where: str) -> Any:
     """
     form = int.from_bytes(data[:2]) if channel.encoding == "cdr" else 0
     if form > PLAIN_CDR:
-        kind = "a parameter list" if form in PARAMETERS else "XCDR2"
-        fault = f"a message on {channel.topic} has the encapsulation {form:#06x} ({kind}), not plain CDR"
+        fault = f"a message on {channel.topic} has the encapsulation {form:#06x}, not plain CDR"
         raise EpisodeError(where, fault, "record again with XCDR1 as the publisher's data representation")
     # The libraries below raise almost any error for damaged definitions and bytes.
     try:
-        read = _decoder(channel)
+        return _decoder(channel)(data)
     except Exception as fault:
-        raise EpisodeError(where, f"{channel.topic}: {_line(fault)}") from fault
-    try:
-        return read(data)
-    except Exception as fault:
-        kind = channel.type or channel.encoding
-        raise EpisodeError(where, f"a message on {channel.topic} is not a {kind}: {_line(fault)}") from fault
-
-
-def _line(fault: BaseException) -> str:
-    return " ".join(str(fault.args[0] if fault.args else fault).split())[:200]
+        kind, said = channel.type or channel.encoding, one_line(fault)
+        raise EpisodeError(where, f"{channel.topic}: a message cannot be read as {kind}: {said}") from fault
 
 
 @lru_cache(maxsize=256)
@@ -242,17 +234,8 @@ def numbers(value: Any) -> list[float]:
     if is_list(value):
         return [number for item in value for number in numbers(item)]
     if is_message(value):
-        return [number for name in field_names(value) for number in _field_numbers(value, name)]
-    kinds = {"str": "text", "bytes": "bytes", "NoneType": "null"}
-    raise TypeError(kinds.get(type(value).__name__, "something that is not a number"))
-
-
-def _field_numbers(message: Any, name: str) -> list[float]:
-    try:
-        return numbers(child(message, name))
-    except TypeError as fault:
-        text = str(fault)
-        raise TypeError(f"{text} of {name}" if " in " in text else f"{text} in {name}") from fault
+        return [number for name in field_names(value) for number in numbers(child(value, name))]
+    raise TypeError(f"a value of the type {type(value).__name__}")
 
 
 def stamp_ns(message: Any, received_ns: int) -> int:

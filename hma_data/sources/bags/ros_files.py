@@ -74,7 +74,7 @@ class Ros1File(IndexedFile):
         magic = file.read(len(ROS1_MAGIC))
         if magic != ROS1_MAGIC:
             shown = magic.split(b"\n")[0].decode("ascii", "replace")
-            raise damaged(self.path, f"begins with {shown!r}, not as a ROS 1 bag" if magic else "is empty")
+            raise damaged(self.path, f"begins with {shown!r}, not as a ROS 1 bag")
         header, _, _ = _record(_whole(file), len(ROS1_MAGIC))
         if header.get("encryptor"):
             raise ValueError("it is encrypted")

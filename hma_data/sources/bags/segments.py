@@ -11,11 +11,10 @@ arrives, or when a field of it becomes a value.
 
 import json
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,15 +27,14 @@ from hma_data.sources.bags.bag import Bag, BagPlace
 from hma_data.sources.bags.clocks import SECOND_NS, MessageTimes
 from hma_data.sources.bags.container import Recent, Record, RecordFilter
 from hma_data.sources.bags.images import STILL_IMAGE, VIDEO, image_kind
-from hma_data.sources.bags.messages import decode
+from hma_data.sources.bags.messages import decode, is_list, is_message
 from hma_data.sources.bags.topic_track import TopicTrack, missing_topic, parse_key
 from hma_data.storage.files import cache_folder, short_sha256, write_atomic
 
 MAX_VALUES = 8  # values of a marker in an error
 MAX_DELAY_S = 10.0  # header stamps further from receipt than this come from another clock
 KEPT_BAGS = 2
-KEPT_TABLES = 512
-TABLE = 2  # version of what is kept of a table
+TABLE = 3  # version of what is kept of a table
 
 
 @dataclass(frozen=True)
@@ -66,16 +64,13 @@ class SegmentTable:
         frames: frames of the primary camera in the whole bag.
         clock: of that camera, header or receive.
         reach_ns: how far outside the episode's receipt times its messages may have been received.
-        empty: parts without a frame, which are not episodes.
-        keyframes: video camera -> ascending times of receipt of its key frames; of its first message where
-            the codec does not show them.
+        keyframes: video camera -> ascending times of receipt of its key frames.
     """
 
     segments: tuple[Segment, ...]
     frames: int
     clock: str
     reach_ns: int
-    empty: int = 0
     keyframes: dict[str, list[int]] = field(default_factory=dict)
 
     @property
@@ -85,31 +80,29 @@ class SegmentTable:
 
 
 # By process id: a forked child must not clean up after its parent.
-_bags: dict[int, Recent[Any, Bag]] = {}
-_tables = Recent[Any, SegmentTable](KEPT_TABLES)
+_kept: dict[int, Recent[Any, tuple[Bag, SegmentTable]]] = {}
 
 
-def parted(opened: Bag, root: Path, embodiment: Embodiment, segments: Segments) -> tuple[Bag, SegmentTable]:
+def parted(opened: Bag, embodiment: Embodiment, segments: Segments) -> tuple[Bag, SegmentTable]:
     """Return the bag and its episodes, from the cache where no file changed.
 
     Raises:
         EpisodeError: the bag cannot be read, or holds no episode.
     """
-    path, state = opened.path, opened.state()
-    bag = _bags.setdefault(os.getpid(), Recent(KEPT_BAGS)).get((path, root, state), lambda: opened)
+    path, state, primary = opened.path, opened.state(), embodiment.primary_camera.name
     cameras = tuple((camera.key, camera.stamp) for camera in embodiment.cameras)
-    key = (path, state, segments, cameras, embodiment.primary_camera.name, embodiment.sync.stamp)
-    table = _tables.get(key, lambda: _stored(key, lambda: part(bag, embodiment, segments)))
-    return bag, table
+    key = (path, state, segments, cameras, primary, embodiment.sync.stamp)
+    kept = _kept.setdefault(os.getpid(), Recent(KEPT_BAGS))
+    return kept.get(key, lambda: (opened, _stored(key, opened, embodiment, segments)))
 
 
-def _stored(key: Any, make: Callable[[], SegmentTable]) -> SegmentTable:
+def _stored(key: Any, bag: Bag, embodiment: Embodiment, segments: Segments) -> SegmentTable:
     """Return the table of a bag from this machine's cache, so that its workers read the bag once."""
     kept = cache_folder() / "bags" / f"{short_sha256(repr((TABLE, key)), 32)}.json"
     with suppress(OSError, ValueError, KeyError, TypeError):
         values = json.loads(kept.read_bytes())
         return SegmentTable(tuple(Segment(**one) for one in values.pop("segments")), **values)
-    table = make()
+    table = part(bag, embodiment, segments)
     with suppress(OSError):
         kept.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(kept, json.dumps(asdict(table)))
@@ -168,8 +161,9 @@ def part(bag: Bag, embodiment: Embodiment, segments: Segments) -> SegmentTable:
         frames=len(times),
         clock=clock,
         reach_ns=SECOND_NS + int(min(float(delay_s), MAX_DELAY_S) * SECOND_NS),
-        empty=len(parts) - len(found),
-        keyframes={key: _keyframes(tracks[key]) for key in videos},
+        keyframes={
+            key: sorted(tracks[key].times.received[tracks[key].keyframes()].tolist()) for key in videos
+        },
     )
 
 
@@ -223,11 +217,6 @@ def _segment(received: Ints, begin: int, stop: int) -> Segment:
     return Segment(begin, stop, first_ns, int(received[stop - 1]), skip)
 
 
-def _keyframes(track: TopicTrack) -> list[int]:
-    flags, received = track.keyframes(), track.times.received
-    return sorted((received[:1] if flags is None else received[flags]).tolist())
-
-
 # -- markers
 
 
@@ -278,14 +267,9 @@ class MarkerTrack:
         value, wanted = self._field.value(message, self._where), self.marker.equals
         if len(self._seen) < MAX_VALUES:
             self._seen[str(value)] = None
-        if isinstance(wanted, str) or isinstance(value, str):
-            if type(wanted) is not type(value):
-                fault = f"{self.marker.key} is {value!r}, which cannot equal {wanted!r}"
-                raise EpisodeError(self._where, fault, "correct equals in source.segments")
-            return bool(value == wanted)
-        try:
-            return float(value) == float(wanted or 0)
-        except (TypeError, ValueError) as fault:
+        if isinstance(value, str) != isinstance(wanted, str) or is_message(value) or is_list(value):
+            fault = f"{self.marker.key} is {value!r}, which cannot equal {wanted!r}"
             raise EpisodeError(
-                self._where, f"{self.marker.key} is not a single value", "name one field of it"
-            ) from fault
+                self._where, fault, "correct the key (name one field) or equals in source.segments"
+            )
+        return bool(value == wanted)

@@ -81,13 +81,13 @@ class RosbagSource:
             path, *parts = bags[episode_id]
             bag = Bag(path, root, parts)
             if segments:
-                bag = parted(bag, root, embodiment, segments)[0]
+                bag = parted(bag, embodiment, segments)[0]
             return _EpisodeReading(bag, episode_id, embodiment).episode()
         if not segments or not match or match["bag"] not in bags:
             raise SourceError(uri, f"has no bag {episode_id!r}", f"it has {', '.join(list(bags)[:10])}")
         name, number = match["bag"], int(match["number"])
         path, *parts = bags[name]
-        bag, table = parted(Bag(path, root, parts), root, embodiment, segments)
+        bag, table = parted(Bag(path, root, parts), embodiment, segments)
         if number >= len(table.segments):
             held = f"{name} holds {_part_id(name, 0)} to {_part_id(name, len(table.segments) - 1)}"
             raise SourceError(uri, f"has no episode {episode_id!r}", held)
@@ -126,7 +126,7 @@ def _refs(name: str, paths: list[Path], root: Path, embodiment: Embodiment | Non
         segments = embodiment.source.segments if embodiment else None
         if not embodiment or not segments:
             return [EpisodeRef(name, _frames(bag, embodiment), fingerprint=fingerprint)]
-        table = parted(bag, root, embodiment, segments)[1]
+        table = parted(bag, embodiment, segments)[1]
     except (EpisodeError, OSError):
         return [EpisodeRef(name, 0, fingerprint=fingerprint)]
     return [
@@ -163,7 +163,7 @@ class _EpisodeReading:
         number: int = 0,
     ) -> None:
         self._bag, self._id, self._embodiment = bag, episode_id, embodiment
-        self._table, self._number = table, number
+        self._table = table
         self._segment = table.segments[number] if table else None
         self._where = str(bag.path) if table is None else f"{bag.path}, episode {number}"
         self._counts = bag.topics()
@@ -192,10 +192,6 @@ class _EpisodeReading:
         for camera in embodiment.cameras:
             same = camera is embodiment.primary_camera
             streams[camera.name] = primary if same else self._stream(camera, shown)
-        clocks = {
-            topic: "receive" if track.times.stamps is None else "header"
-            for topic, track in self._tracks.items()
-        }
         parted = self._table is not None and len(self._table.segments) > 1
         action_signals = tuple(self._signal(column, shown) for column in actions)
         flags = self._held_actions(actions, action_signals, shown)
@@ -208,7 +204,7 @@ class _EpisodeReading:
             instruction=(self._said and self._said[1]) or notes.get("instruction", ""),
             success=None if parted else {"true": True, "false": False}.get(notes.get("success", "").lower()),
             source=str(self._bag.path),
-            metadata={"clocks": clocks, "notes": notes} | ({"flags": flags} if flags else {}) | self._about(),
+            metadata={"flags": flags},
         )
 
     def _held_actions(
@@ -234,8 +230,7 @@ class _EpisodeReading:
         columns = []
         for component in components:
             place = parse_key(component.key, self._counts, self._where)
-            types = {channel.type for channel in self._bag.counts() if channel.topic == place.topic}
-            column = Column(component, place, self._where, len(types) > 1)
+            column = Column(component, place, self._where)
             self._track(column.field.topic).columns.append(column)
             columns.append(column)
         return columns
@@ -365,17 +360,3 @@ class _EpisodeReading:
         last = shown[-1] + (self._embodiment.sync.tolerance_ms or 0) / 1e3
         stop = low + int(np.searchsorted(rising, last, side="left")) + 1
         return begin, min(max(stop, begin + 1), high)
-
-    def _about(self) -> dict[str, dict[str, int]]:
-        if self._segment is None or self._table is None:
-            return {}
-        facts = {
-            "number": self._number,
-            "of": len(self._table.segments),
-            "first_frame": self._segment.first,
-            "frames": len(self._segment),
-            "frames_in_bag": self._table.frames,
-            "frames_left_out": self._table.left_out,
-            "parts_without_frames": self._table.empty,
-        }
-        return {"segment": facts}

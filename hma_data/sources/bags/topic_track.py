@@ -26,6 +26,7 @@ from hma_data.sources.bags.bag import Bag, BagPlace
 from hma_data.sources.bags.clocks import DAY_S, SECOND_NS, MessageTimes
 from hma_data.sources.bags.container import Channel
 from hma_data.sources.bags.images import (
+    CODECS,
     VIDEO,
     Messages,
     StillStream,
@@ -145,14 +146,11 @@ class Column:
 
     Where a message names its values (see `value_names`), the component's `names` select and order them,
     unless the key or the YAML slices. Otherwise all messages must name the same. Messages of another
-    publisher, with none of the component's names, are left out; so are those of another type without the
-    field, where a topic has several types.
+    publisher, with none of the component's names, are left out.
     """
 
-    def __init__(self, component: Component, field: Field, where: str, several_types: bool = False) -> None:
+    def __init__(self, component: Component, field: Field, where: str) -> None:
         self.component, self.field = component, field
-        self._several_types = several_types
-        self._type: str | None = None  # of the messages that have the field
         self._where = where
         self._values, self._rows = array("d"), array("q")
         self._width: int | None = None
@@ -163,18 +161,10 @@ class Column:
         whole = not component.slice and field.steps and isinstance(field.steps[-1], str)
         self._selects = bool(component.names and whole)
 
-    def add(self, message: Any, row: int, kind: str) -> None:
-        """Add the values of message `row`, which is of that type."""
-        try:
-            path = self.field.path(message, self._where)
-        except EpisodeError:
-            if self._several_types and kind != self._type:
-                return
-            raise
-        if self._type not in (None, kind):
-            fault = f"{self.field.key}: {self._type} and {kind} on this topic both have it"
-            raise EpisodeError(self._where, fault, "filter the recording to one of them")
-        self._type, value = kind, path[-1]
+    def add(self, message: Any, row: int) -> None:
+        """Add the values of message `row`."""
+        path = self.field.path(message, self._where)
+        value = path[-1]
         try:
             values = numbers(value)
         except TypeError as fault:
@@ -222,8 +212,6 @@ class Column:
         Raises:
             EpisodeError: none did.
         """
-        if self._type is None:
-            raise EpisodeError(self._where, f"{self.field.key}: no type of messages on this topic has it")
         if not self._rows:
             seen = sorted({name for names in self._picks for name in names})[:MAX_NAMES]
             names = ", ".join(self.component.names or ())
@@ -286,28 +274,37 @@ class TopicTrack:
         self.codec = ""
         self.b_slices = False
         self._log_ns, self._stamp_ns, self._places = array("q"), array("q"), array("q")
-        self._keyframes: list[bool | None] = []
+        self._keyframes: list[bool] = []
 
     def __len__(self) -> int:
         return len(self._log_ns)
 
     def add(self, channel: Channel, log_ns: int, place: BagPlace, message: Any) -> None:
-        """Add the next message; a message that cannot be decoded is None, and keeps its time of receipt."""
-        for column in self.columns:
-            column.add(message, len(self), channel.type)
-        if not len(self) or channel not in self.channels:
+        """Add the next message; a message that cannot be decoded is None, and keeps its time of receipt.
+
+        Raises:
+            EpisodeError: it is of another type than those before, or does not have what a column reads.
+        """
+        if channel not in self.channels:
+            if message is not None and self.channels and channel.type != self.channels[0].type:
+                fault = f"{self.topic} carries {self.channels[0].type} and {channel.type}"
+                raise EpisodeError("the bag", fault, "filter the recording to one of them")
             self.kind = content_kind(message, image_kind(channel.type))
+            self.channels.append(channel)
+        for column in self.columns:
+            column.add(message, len(self))
         if message is not None and self.kind == VIDEO:
             self._keyframes.append(self._is_keyframe(message))
-        if channel not in self.channels:
-            self.channels.append(channel)
         self._log_ns.append(min(log_ns, INT64.max))
         self._stamp_ns.append(min(max(stamp_ns(message, log_ns), INT64.min), INT64.max))
         self._places.extend((*place, self.channels.index(channel)))
 
-    def _is_keyframe(self, message: Any) -> bool | None:
+    def _is_keyframe(self, message: Any) -> bool:
         try:
             self.codec = self.codec or video_codec(message)
+            if self.codec not in CODECS:
+                fault, remedy = f"video in {self.codec!r} cannot be read", f"these can: {', '.join(CODECS)}"
+                raise EpisodeError(self.topic, fault, remedy)
             data = payload(message)
             self.b_slices = self.b_slices or (self.codec == "h264" and has_b_slices(data))
             return is_keyframe(data, self.codec)
@@ -337,10 +334,8 @@ class TopicTrack:
         """Return (T, 4): file, two numbers of the place in it, index into `channels`."""
         return np.frombuffer(self._places, np.int64).reshape(-1, 4)
 
-    def keyframes(self) -> Bools | None:
-        """Return (T,) whether decoding can begin at a message; None where the codec does not show it."""
-        if None in self._keyframes:
-            return None
+    def keyframes(self) -> Bools:
+        """Return (T,) whether decoding can begin at a message."""
         return np.array(self._keyframes, bool)
 
 
@@ -366,9 +361,9 @@ def camera_stream(
         EpisodeError: the topic holds no images, or video that never begins; or the clock was set back.
     """
     where = f"{bag.path}, {track.topic}"
-    if track.kind is None or len({image_kind(channel.type) for channel in track.channels}) > 1:
-        types = ", ".join(sorted({channel.type or channel.encoding for channel in track.channels}))
-        raise EpisodeError(where, f"holds {types}, not images", "name a topic of images as the camera's key")
+    if track.kind is None:
+        stated = track.channels[0].type or track.channels[0].encoding
+        raise EpisodeError(where, f"holds {stated}, not images", "name a topic of images as the camera's key")
     times = track.times
     rows = times.by_receipt()
     begin, stop = shown or (0, len(rows))
@@ -385,8 +380,6 @@ def _video_stream(bag: Bag, track: TopicTrack, clock: str, shown: tuple[int, int
     times = track.times
     rows = times.by_receipt()
     keyframes = track.keyframes()
-    if keyframes is None:  # only the first message is certain to be one
-        keyframes = np.arange(len(track)) == rows[0]
     key_places = np.flatnonzero(keyframes[rows])
     if not len(key_places):
         raise EpisodeError(where, f"the {track.codec} video has no key frame")

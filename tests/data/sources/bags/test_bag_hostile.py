@@ -36,14 +36,14 @@ def killed(path: Path) -> None:
     path.rename(f"{path}.active")
 
 
-@pytest.mark.parametrize(("kind", "name"), [(3, "a parameter list"), (7, "XCDR2"), (0x15, "XCDR2")])
-def test_messages_that_are_not_plain_cdr_are_refused(kind: int, name: str, recording, tmp_path) -> None:
+@pytest.mark.parametrize("kind", [3, 7, 0x15])  # a parameter list, XCDR2
+def test_messages_that_are_not_plain_cdr_are_refused(kind: int, recording, tmp_path) -> None:
     def other(encoded: bag_files.Encoded) -> bag_files.Encoded:
         return encoded._replace(encode=lambda item: bytes([0, kind]) + encoded.encode(item)[2:])
 
     how = {topic: other(encoded) for topic, encoded in bag_files.as_cdr().items()}
     path = bag_files.write_mcap(tmp_path / "run.mcap", recording, how)
-    said = rf"a message on /\S+ has the encapsulation {kind:#06x} \({name}\), not plain CDR — record again"
+    said = rf"a message on /\S+ has the encapsulation {kind:#06x}, not plain CDR — record again"
     with pytest.raises(EpisodeError, match=said):
         read_all(path, arm())
     assert re.search(said, " | ".join(SOURCE.inspect(str(path)).problems))

@@ -85,7 +85,6 @@ def test_stamps_that_are_no_clock_give_way_to_log_times(tmp_path, recording, sta
     episode = read(path, arm())
     late = (recording.picture_ns + LATE_NS) / 1e9
     np.testing.assert_allclose(episode.streams["front"].timestamps, late, atol=1e-6)
-    assert episode.metadata["clocks"] == {CAMERA: "receive", COMMAND: "receive", STATE: "header"}
 
 
 def test_a_clip_of_a_bag_pairs_each_picture_with_the_command_in_force(bags, recording) -> None:
@@ -214,8 +213,8 @@ def test_a_second_publisher_of_joints_keeps_its_own_times(numbers_bag: Path) -> 
         ("/joints.position", 2, ", names: [a, z]", "lacks z.*names a, b"),
         ("/joints.position", 1, ", names: [z]", "no message names z.*a, b, gripper"),
         ("/joints.velocity", 1, "", "is empty in message 0"),
-        ("/joints", 1, "", "text in frame_id of header.*name a field of it: header, name"),
-        ("/text.data", 1, "", "holds text"),
+        ("/joints", 1, "", "the type str, not only numbers.*name a field of it: header, name"),
+        ("/text.data", 1, "", "holds a value of the type str"),
         ("/cmd.angular", 2, "", "has 3 values, the embodiment says 2"),
         ("/cmd.angular[x]", 1, "", "is not a path"),
     ],
