@@ -7,7 +7,6 @@ sample of episodes read and aligned as this robot's; for a shard set those of it
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -104,7 +103,7 @@ def inspect_recording(
     if not inspection.episodes:
         found.append(NO_EPISODES)
     elif robot:
-        report["embodiment"] = _fit(uri, robot, source, inspection, found)
+        report["embodiment"] = _fit(uri, robot, source, found)
     else:
         lack, held, offsets = proposal(inspection)
         report["facts"] |= {f"actions {name}": offset.measured for name, offset in offsets.items()}
@@ -117,9 +116,7 @@ def inspect_recording(
     return report
 
 
-def _fit(
-    uri: str, robot: Embodiment, source: Source, inspection: Inspection, found: list[Finding]
-) -> dict[str, str]:
+def _fit(uri: str, robot: Embodiment, source: Source, found: list[Finding]) -> dict[str, str]:
     """Return facts on the first episode that the embodiment can read; add the faults to `found`."""
     facts = {"embodiment": f"{robot.id}, {robot.action_dim} action dims"}
     faults: list[HMAError] = []
@@ -134,8 +131,7 @@ def _fit(
         faults.append(clip)
     else:
         first = faults[0] if faults else SourceError(uri, "has no episodes")
-        said = f"{robot.id} does not fit: {first}{_alike(robot, inspection)}"
-        found.append(Finding("fits", "error", said))
+        found.append(Finding("fits", "error", f"{robot.id} does not fit: {first}"))
         return facts
     if faults:
         said = f"{len(faults)} of the first {len(faults) + 1} episodes cannot be used: {faults[0]}"
@@ -157,21 +153,9 @@ def _fit(
     for key, (offset, finding) in judged([clip], robot).items():
         facts[f"actions {key}"] = offset.measured
         found += [finding] if finding else []
-    if hz and is_off_rate(hz, robot):
-        said = f"{robot.id} says {robot.rate_hz:g} Hz, the aligned recording has {hz:.3g} Hz"
-        numbers = {"hz": hz, "stated_hz": robot.rate_hz}
-        found.append(Finding("rate", "error", said, numbers=numbers))
+    found += [one for one in _times([clip], robot) if one.check == "rate"]
     constant = _constant(clip.actions.std(axis=0), robot)
     return facts | ({"constant in it": "action " + ", ".join(constant)} if constant else {})
-
-
-def _alike(robot: Embodiment, inspection: Inspection) -> str:
-    """Return a hint with recorded keys whose names are near to those that the YAML names."""
-    known = [key.key for key in inspection.keys]
-    wanted = [camera.key for camera in robot.cameras] + [part.key for part in robot.action.components]
-    missing = [key for key in wanted if key not in known and not key.startswith("/")]
-    near = [alike for key in missing for alike in get_close_matches(key, known, n=2)]
-    return f" (recorded keys like it: {', '.join(near)})" if near else ""
 
 
 def _constant(deviations: Array, robot: Embodiment) -> list[str]:
@@ -399,7 +383,8 @@ def _times(clips: list[Clip], robot: Embodiment) -> Iterator[Finding]:
     hz = measured_hz(steps)
     if hz and is_off_rate(hz, robot):
         said = f"the aligned frames have {hz:.3g} Hz, the YAML says {robot.rate_hz:g}"
-        yield Finding("rate", "error", said, rate_remedy(robot))
+        numbers = {"hz": hz, "stated_hz": robot.rate_hz}
+        yield Finding("rate", "error", said, rate_remedy(robot), numbers=numbers)
     if hz and (steps > 3 / hz).any():
         said = f"frames pause for up to {steps.max():.3g} s; no window crosses pauses of a model step or more"
         yield Finding("gaps", "warn", said, pause_remedy(robot, hz))

@@ -22,7 +22,6 @@ from hma_data.shards.schema import token_column
 from hma_data.sources.common.checks import Finding, Severity
 from hma_data.sources.common.survey import listed, sampled
 from hma_data.storage.paths import StrPath
-from hma_data.tokenizers.base import Tokenizer
 
 MAX_LOST_SHARE = 0.1  # share of the windows above which the loss is a warning
 MAX_MEASURED = 20  # flagged episodes of which the first with more than one row is measured
@@ -118,7 +117,6 @@ def kept_findings(
     shards: ShardSet,
     weights: StrPath | None = None,
     device: str = "cpu",
-    tokenizer: Tokenizer | None = None,
 ) -> Iterator[Finding]:
     """Yield for each camera how well what moves is kept by the tokens, in a few episodes of all splits.
 
@@ -127,11 +125,10 @@ def kept_findings(
 
     Args:
         weights, device: of the tokenizer, as `get_tokenizer` takes them.
-        tokenizer: that decodes; None takes the set's own.
     """
     rows, spec = shards.episodes.take(sampled(len(shards.episodes), EPISODES)).to_pylist(), shards.spec
     try:
-        opened = tokenizer or tokenizer_of(shards, weights, device)
+        opened = tokenizer_of(shards, weights, device)
         recorded = [(row, Recorded(shards, row)) for row in rows]
         for name in shards.manifest.cameras:
             kept, part = Kept(), MovingPart()

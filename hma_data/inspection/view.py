@@ -170,13 +170,12 @@ def view_recording(
     return view
 
 
-def view_shards(folder: StrPath, episode: int = 0, tokenizer: Tokenizer | None = None) -> View:
+def view_shards(folder: StrPath, episode: int = 0) -> View:
     """Show an episode of a shard set; its frames are decoded from the tokens.
 
     Args:
         folder: str or path of the set, or its URI.
         episode: number of the episode, in the order of episodes.parquet.
-        tokenizer: tokenizer that decodes; None takes the set's own.
 
     Raises:
         UsageError: the set has no such episode.
@@ -185,7 +184,7 @@ def view_shards(folder: StrPath, episode: int = 0, tokenizer: Tokenizer | None =
     shards = ShardSet(folder)
     ids = shards.episodes["id"].to_pylist()
     _number(ids, episode, str(shards.folder))
-    coder = tokenizer or tokenizer_of(shards)
+    coder = tokenizer_of(shards)
     row = shards.episodes.slice(episode, 1).to_pylist()[0]
     robot, cameras = shards.embodiment, shards.manifest.cameras
     reader = EpisodeReader(shards, shards.columns(cameras))

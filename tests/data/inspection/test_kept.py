@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from hma_data.episodes.movement import Kept, MovingPart, framing
+from hma_data.inspection import shard_findings
 from hma_data.inspection.infer import infer
 from hma_data.inspection.inspect import examine
 from hma_data.inspection.shard_findings import kept_findings
@@ -111,12 +112,13 @@ def test_tokens_that_lose_the_robot_are_a_warning_and_with_the_crop_they_keep_it
     assert better.numbers["moving_share"] > 4 * found.numbers["moving_share"]
 
 
-def test_a_set_whose_recording_is_gone_says_that_nothing_was_measured(tmp_path: Path) -> None:
+def test_a_set_whose_recording_is_gone_says_that_nothing_was_measured(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(shard_findings, "tokenizer_of", lambda *given: BlockTokenizer())
     folder = toy_shards(tmp_path / "set", [12, 13])
-    (kept,) = kept_findings(ShardSet(folder), tokenizer=BlockTokenizer())
+    (kept,) = kept_findings(ShardSet(folder))
     assert kept.severity == "info" and "are decoded at" in kept.message
     folder.with_suffix(".hdf5").unlink()
-    (found,) = kept_findings(ShardSet(folder), tokenizer=BlockTokenizer())
+    (found,) = kept_findings(ShardSet(folder))
     assert found.severity == "info" and "was not measured" in found.message
 
 

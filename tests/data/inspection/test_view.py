@@ -62,11 +62,12 @@ def test_a_recording_is_shown_frame_by_frame(toy_yaml: Path, tmp_path: Path) -> 
     assert list(reader(tmp_path / "seen.rrd").blueprints())
 
 
-def test_a_shard_set_is_shown_by_its_decoded_tokens(toy_yaml: Path, tmp_path: Path) -> None:
+def test_a_shard_set_is_shown_by_its_decoded_tokens(toy_yaml: Path, tmp_path: Path, monkeypatch) -> None:
     settings = Settings(val_fraction=0.3, cameras=("top", "side"))
     robot, tokenizer = Embodiment.from_yaml(ARM_YAML), BlockTokenizer()
     convert(robot, str(tmp_path / "toy.hdf5"), tokenizer, tmp_path / "set", settings=settings)
-    view_shards(tmp_path / "set", 2, tokenizer).save(tmp_path / "seen.rrd")
+    monkeypatch.setattr("hma_data.inspection.view.tokenizer_of", lambda shards: tokenizer)
+    view_shards(tmp_path / "set", 2).save(tmp_path / "seen.rrd")
     found, shards = read(tmp_path / "seen.rrd"), ShardSet(tmp_path / "set")
     row = shards.episodes.slice(2, 1).to_pylist()[0]
     columns = [*shards.columns()]
