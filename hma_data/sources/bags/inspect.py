@@ -55,7 +55,6 @@ LOG_TOPICS = ("/rosout", "/rosout_agg", "/parameter_events", "/diagnostics", "/d
 GEOMETRY = {"x", "y", "z", "w", "theta", "position", "orientation", "linear", "angular"}
 GEOMETRY |= {"translation", "rotation"}
 PAIRS = 4  # runs of neighbouring frames looked at, for a camera
-APART_S = 1.0  # header stamps further than this from receive times are reported
 ALL_LEVELS = (0.0, 65535.0)  # levels at which frames in mono16 are looked at
 
 
@@ -278,10 +277,6 @@ class _BagInspection:
         self._survey.made.add("stamps")
         self._frozen += [track.topic] if track.frozen else []
         times, remedy = track.times, ""
-        apart = abs(times.clock().delay_s)
-        if apart > APART_S:
-            said = f"{track.topic}: header stamps are {apart:.3g} s from receive times"
-            self._survey.note(Finding("stamps", "warn", said, key=track.topic, numbers={"seconds": apart}))
         if times.order("header") is None:
             remedy = times.set_back_error("header", str(self.bag.path)).remedy
         self._survey.times(self._name, track.topic, self.clocks[track.topic].header, camera, remedy)
