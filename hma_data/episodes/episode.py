@@ -78,7 +78,7 @@ class Episode:
         source: the file or URI it comes from.
         metadata: `flags`, name -> count, are written to episodes.parquet and added up in the summary of a
             conversion; `language`, what is said in words about moments of the episode, is written there too,
-            see `hma_data.sources.lerobot.language`. Other plain values are passed over.
+            see `hma_data.sources.lerobot.language`.
     """
 
     id: str

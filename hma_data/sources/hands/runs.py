@@ -166,7 +166,11 @@ class Runs:
     spans: tuple[tuple[int, int], ...]  # [from, to) into the labels; the last frame of a run only ends it
     missing: Bools  # (N,) whether a label lacks a needed hand; held ones do not count
     held: Bools  # (N,) whether a needed hand keeps its last position
-    counts: dict[str, int]  # numbers of frames: labelled, without_hands, outside, held, dropped
+
+    @property
+    def dropped(self) -> int:
+        """Count the labels that are in no run."""
+        return len(self.labels) - sum(stop - start - 1 for start, stop in self.spans)
 
 
 def cut_into_runs(
@@ -184,7 +188,7 @@ def cut_into_runs(
     """
     labels = _within(labels, video.frames, where)
     size = layout.label_size or (video.width, video.height)
-    labels, outside = _as_fractions(labels, needed, size, where)
+    labels = _as_fractions(labels, needed, size, where)
     for point in needed:
         if not np.isfinite(labels.points[point]).any():
             have = [name for name, values in labels.points.items() if np.isfinite(values).any()]
@@ -205,14 +209,7 @@ def cut_into_runs(
         for start, stop in find_spans(labels.frames, usable, widest)
         if episode_frames(labels, (start, stop), layout) - int((~there[start:stop]).sum()) >= least
     ]
-    counts = {
-        "labelled": len(labels),
-        "without_hands": int(without.sum()),
-        "outside": outside,
-        "held": int((without & there).sum()),
-        "dropped": len(labels) - sum(stop - start - 1 for start, stop in long),
-    }
-    return Runs(labels, tuple(long), ~there, without & there, counts)
+    return Runs(labels, tuple(long), ~there, without & there)
 
 
 def episode_frames(labels: HandLabels, span: tuple[int, int], layout: HandsLayout) -> int:
@@ -255,26 +252,22 @@ def _within(labels: HandLabels, frames: int, where: str) -> HandLabels:
     return replace(labels, frames=labels.frames[inside], points=points)
 
 
-def _as_fractions(
-    labels: HandLabels, needed: Sequence[str], size: tuple[int, int], where: str
-) -> tuple[HandLabels, int]:
-    """Convert labels to fractions of the image; treat hands outside it as missing, and count them."""
-    points, lost = {}, np.zeros(len(labels), bool)
+def _as_fractions(labels: HandLabels, needed: Sequence[str], size: tuple[int, int], where: str) -> HandLabels:
+    """Convert labels to fractions of the image; treat hands outside it as missing."""
+    points = {}
     for point, raw in labels.points.items():
         values = raw / np.tile(size, raw.shape[1] // 2) if labels.pixels else raw
         with np.errstate(invalid="ignore"):
             beyond = np.any((values < -OUTSIDE_TOLERANCE) | (values > 1 + OUTSIDE_TOLERANCE), axis=1)
         seen = int(np.isfinite(values).all(axis=1).sum())
-        if point in needed:
-            lost |= beyond
-            if beyond.sum() > seen / 2:
-                x, y = raw[beyond][0, :2]
-                fault = f"{int(beyond.sum()):,} of {seen:,} labels of {point} lie outside the image of "
-                fault += f"{size[0]}×{size[1]} pixels, the first at {x:.4g}, {y:.4g}"
-                remedy = "check that these are its labels, and source.layout.label_size"
-                raise EpisodeError(where, fault, remedy)
+        if point in needed and beyond.sum() > seen / 2:
+            x, y = raw[beyond][0, :2]
+            fault = f"{int(beyond.sum()):,} of {seen:,} labels of {point} lie outside the image of "
+            fault += f"{size[0]}×{size[1]} pixels, the first at {x:.4g}, {y:.4g}"
+            remedy = "check that these are its labels, and source.layout.label_size"
+            raise EpisodeError(where, fault, remedy)
         points[point] = np.where(beyond[:, None], np.nan, np.clip(values, 0, 1))
-    return replace(labels, points=points, pixels=False), int(lost.sum())
+    return replace(labels, points=points, pixels=False)
 
 
 def _gaps_filled(labels: HandLabels) -> tuple[HandLabels, int]:

@@ -17,7 +17,7 @@ needed hand does: see the module `runs`.
 With annotations, each run of at least `min_frames` is an episode, `clip.mp4#0`, `clip.mp4#1`, …; the plain
 name `clip.mp4` is the longest run. Runs of one video share a group, so that they come into one split. The
 detector runs only while an episode is read; so with it, a video is one episode, `clip.mp4`: its longest run.
-The episode's metadata and flags count the frames that are held, masked and left out.
+The episode's flags count the frames that are held, masked and left out.
 
 T frames of an episode.
 """
@@ -120,7 +120,8 @@ class HandsSource:
         runs = cut_into_runs(labels, needed, layout, header, str(video.path))
         if not runs.spans:
             fault = f"has no run of {layout.min_frames} frames with {', '.join(needed)}: "
-            fault += f"{runs.counts['without_hands']:,} of {runs.counts['labelled']:,} frames lack one"
+            lacking = int((runs.missing | runs.held).sum())
+            fault += f"{lacking:,} of {len(runs.labels):,} frames lack one"
             raise EpisodeError(video.path, fault, _MORE_RUNS)
         if number is not None and number >= len(runs.spans):
             raise EpisodeError(video.path, f"has {len(runs.spans)} runs, no run {number}")
@@ -210,7 +211,7 @@ def _episode(
     episode_id: str, file: VideoFile, runs: Runs, number: int | None, embodiment: Embodiment
 ) -> Episode:
     """Make the episode of run `number`; None makes that of the longest run, as the only one of its video."""
-    labels, layout, counts = runs.labels, layout_of(embodiment), runs.counts
+    labels, layout = runs.labels, layout_of(embodiment)
     longest = int(np.argmax([stop - start for start, stop in runs.spans]))
     chosen = longest if number is None else number
     span = start, stop = runs.spans[chosen]
@@ -231,7 +232,7 @@ def _episode(
     if number is None:
         left = len(labels) - (stop - start - 1)
     elif number == 0:
-        left = counts["dropped"]
+        left = runs.dropped
     held, masked = (int(marked[start : stop - 1].sum()) for marked in (runs.held, runs.missing))
     flags = {"held_frames": held, "masked_frames": masked, "dropped_frames": left}
     return Episode(
@@ -242,9 +243,7 @@ def _episode(
         rate_stamped=steady,
         instruction=text,
         source=str(file.path),
-        metadata={"labels": layout.labels, "run": chosen, "runs": len(runs.spans)}
-        | {"first_frame": int(marks[0]), "video_frames": len(file), **counts}
-        | {"flags": {name: count for name, count in flags.items() if count}},
+        metadata={"flags": flags},
     )
 
 

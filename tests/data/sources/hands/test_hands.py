@@ -167,7 +167,7 @@ def test_hold_keeps_the_last_place_for_so_many_frames(folder: Path) -> None:
     episode = open_source("hands").read(str(folder), "a.mp4#0", robot)
     held = [9 if i in (10, 11) else 19 if i > 19 else i for i in range(1, 22)]
     np.testing.assert_allclose(episode.actions[0].values[:, 2:], made.expected(held)[:20, 2:], atol=1e-6)
-    assert episode.metadata["held"] == 4 and episode.metadata["without_hands"] == 7
+    assert episode.metadata["flags"]["held_frames"] == 3  # and one where the run ends
 
 
 def test_nan_says_that_there_is_no_hand(folder: Path) -> None:
@@ -229,8 +229,8 @@ def test_runs_values_and_counts_against_a_plain_loop(data: st.DataObject) -> Non
                 np.testing.assert_array_equal(now[row], here)
                 np.testing.assert_array_equal(after[row], there)
                 np.testing.assert_array_equal(change[row], there - here)
-    assert runs.counts["labelled"] == length == used + runs.counts["dropped"]
-    assert runs.counts["without_hands"] == sum(not all(pair) for pair in seen)
+    assert len(runs.labels) == length == used + runs.dropped
+    assert (runs.missing | runs.held).sum() == sum(not all(pair) for pair in seen)
 
 
 def test_labels_of_every_third_frame_run_on_and_a_missing_one_ends_the_run() -> None:

@@ -220,7 +220,7 @@ def test_a_folder_of_videos_becomes_episodes_whose_hands_are_the_tables(short, m
     assert (ref.id, ref.frames) == ("clip.mp4", 24)
     episode = source.read(str(short), "clip.mp4", own)
     clip = to_clip(episode, own)
-    assert len(clip) == 23 and episode.rate_stamped and episode.metadata["dropped"] == 1
+    assert len(clip) == 23 and episode.rate_stamped and episode.metadata["flags"]["dropped_frames"] == 1
     assert (clip.actions[:, 0] > clip.actions[:, 2]).all()  # facing us, the left hand is at our right
     np.testing.assert_array_equal(clip.actions[:-1], clip.states[1:])
 
@@ -274,15 +274,13 @@ def test_of_a_video_the_longest_run_is_taken_and_the_rest_counted(blinking: Path
     own = robot(tmp_path, min_frames="3")
     episode = open_source("hands").read(str(blinking), "a.mp4", own)
     np.testing.assert_allclose(episode.actions[0].values[:, 0], 0.02 * np.arange(3, 10), atol=1e-6)
-    said = episode.metadata
-    assert (said["runs"], said["run"], said["first_frame"], said["video_frames"]) == (2, 0, 2, 20)
-    assert (said["without_hands"], said["dropped"]) == (6, 20 - 7 - 5)
+    assert episode.metadata["flags"]["dropped_frames"] == 20 - 7
     held = open_source("hands").read(str(blinking), "a.mp4", robot(tmp_path, missing="hold", max_hold="1"))
-    assert held.metadata["held"] == 2 and len(held.actions[0].values) == 15
+    assert held.metadata["flags"]["held_frames"] == 1 and len(held.actions[0].values) == 15
     strict = open_source("hands").read(
         str(blinking), "a.mp4", robot(tmp_path, min_score="0.6", min_frames="2")
     )
-    assert strict.metadata["runs"] == 2 and strict.metadata["without_hands"] == 7
+    assert strict.metadata["flags"]["dropped_frames"] == 20 - len(strict.actions[0].values)
     with pytest.raises(EpisodeError, match="no run of 12 frames with left/center, right/center: 6 of 20"):
         open_source("hands").read(str(blinking), "a.mp4", robot(tmp_path))
 
