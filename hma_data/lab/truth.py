@@ -49,6 +49,7 @@ def episode(
     seed: int,
     number: int,
     drawn: Collection[int] | None = None,
+    commands: Floats | None = None,
     wander: bool = True,
 ) -> TrueEpisode:
     """Simulate an episode; the same seed and number give the same one, and a longer one begins like it.
@@ -59,6 +60,7 @@ def episode(
         stride: control steps a frame.
         seed, number: as the recorders take them.
         drawn: numbers of the frames to draw; by default all.
+        commands: (T * stride, A) to give it; by default its own driver's.
         wander: of a pusher's episodes, take only those that wander; the others end at the goal.
     """
     simulator = LabSimulator(robot)
@@ -73,8 +75,9 @@ def episode(
             states.append(simulator.state)
             if drawn is None or step // stride in drawn:
                 pictures.append(simulator.simulation.picture())
-        given.append(simulator.recorded())
-        simulator.advance(given[-1])
+        own = simulator.recorded() if commands is None else commands[step].astype(np.float32)
+        given.append(own)
+        simulator.advance(own)
     chunks = np.stack(given).reshape(frames, -1)
     return TrueEpisode(np.stack(pictures), chunks, np.stack(parts), np.stack(states), driven)
 
