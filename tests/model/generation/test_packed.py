@@ -110,16 +110,17 @@ def test_products_of_fewer_bits_keep_the_features_near(precision: str, near: flo
 
 
 @pytest.mark.parametrize(
-    ("precision", "message"),
+    ("precision", "compiled", "message"),
     [
-        ("fp8", "'fp8' is unknown — give float32 or bf16 or int8"),
-        ("bf16", "does not support bf16 — use float32"),
+        ("fp8", False, "'fp8' is unknown — give float32 or bf16 or int8"),
+        ("bf16", False, "does not support bf16 — use float32"),
+        ("int8", True, "int8 needs a processor with AVX-512 VNNI, and no --compile"),
     ],
 )
-def test_a_precision_that_is_not_there_is_refused(precision, message, monkeypatch) -> None:
+def test_a_precision_that_is_not_there_is_refused(precision, compiled, message, monkeypatch) -> None:
     monkeypatch.setattr(engine, "has_bfloat16", lambda: False)
     with pytest.raises(HMAError, match=message):
-        Rollout(small_model(), "arm", precision=precision)
+        Rollout(small_model(), "arm", precision=precision, compile=compiled)
 
 
 @needs_bfloat16
@@ -139,11 +140,6 @@ def test_a_map_in_int8_is_near_the_plain_one() -> None:
     linear, x = nn.Linear(96, 40), torch.randn(3, 7, 96)
     expected = nn.functional.gelu(linear(x))
     assert (QuantizedLinear(linear, "gelu")(x) - expected).abs().max() < 0.02 * expected.abs().max()
-
-
-def test_int8_is_refused_with_a_compiler() -> None:
-    with pytest.raises(HMAError, match="int8 needs a processor with AVX-512 VNNI, and no --compile"):
-        Rollout(small_model(), "arm", precision="int8", compile=True)
 
 
 def test_what_a_rollout_returns_can_be_changed_and_trained_on() -> None:

@@ -11,11 +11,8 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from hma_data.errors import CheckpointError
 from hma_model import hub
 from hma_model.network.model import HMA
-from hma_model.released.config import config_from_released
-from hma_model.released.state import state_from_released
 from tests.model.network_parts import conditions
 
 pytestmark = pytest.mark.real
@@ -107,18 +104,3 @@ def test_statistics_and_sizes_of_each_domain_are_carried(imported: dict[str, Pat
         for part in ("mean", "std"):
             expected = state[f"action_preprocessor.{domain}.{part}"].float().tolist()
             assert checkpoint.stats(domain)["action"][part] == expected
-
-
-def test_a_missing_released_tensor_is_named(real_data: Path) -> None:
-    folder = real_data / "parity" / "discrete"
-    config = config_from_released(json.loads((folder / "config.json").read_text()))
-    state = load_file(folder / "model.safetensors")
-    del state["out_x_proj.weight"]
-    with pytest.raises(CheckpointError, match=r"out_x_proj\.weight"):
-        state_from_released(state, config)
-
-
-def test_a_layout_that_was_never_released_is_refused(real_data: Path) -> None:
-    config = json.loads((real_data / "parity" / "discrete" / "config.json").read_text())
-    with pytest.raises(CheckpointError, match="cross_attention"):
-        config_from_released(config | {"action_network": "cross_attention"})
