@@ -22,7 +22,6 @@ from hma_model.network.stem import Stem
 from hma_model.training import new_stem
 from hma_model.training.loop import TrainResult, finetune, train
 from hma_model.training.recipe import make_recipe
-from tests.command import fails, hma
 from tests.conftest import contents as files
 from tests.hostile import flip
 from tests.hub_state import REPO, ROBOTS
@@ -203,23 +202,6 @@ def test_heads_learn_on_a_frozen_trunk_when_actions_are_the_objective(base, leg,
     a, b = weights(one.checkpoint), weights(four.checkpoint)
     name = "embodiments/leg/head.safetensors:policy.weight"
     assert not torch.equal(a[name], b[name])
-
-
-@pytest.mark.slow
-def test_the_command_takes_shards_overrides_and_json(base, leg, tmp_path):
-    foot = make_shards(tmp_path / "foot", "foot", dims=1, seed=5)
-    words = ["finetune", "--from", str(base.out), "--data", str(leg), str(foot), "--freeze-trunk"]
-    done = run_command(tmp_path, *words, "--out", str(tmp_path / "run"), "--json", *SHORT)
-    assert done.returncode == 0, done.stderr
-    facts = json.loads(done.stdout)
-    assert facts["step"] == 4 and "trunk frozen" in done.stderr and "new stem and head: leg" in done.stderr
-    assert Checkpoint.open(facts["checkpoint"]).embodiments == ("arm", "foot", "hand", "leg")
-
-
-def test_the_command_says_what_is_wrong_in_one_line(base, tmp_path):
-    done = hma("finetune", "--from", base.out, "--data", tmp_path / "none", "--out", tmp_path / "run")
-    fails(done, 1, str(tmp_path / "none"))
-    assert done.stderr.count("\n") == 1
 
 
 def test_another_source_is_no_way_to_go_on_and_the_same_one_elsewhere_is(base, leg, tmp_path):
@@ -412,8 +394,13 @@ def test_a_revision_that_is_not_there_is_said_and_leaves_no_folder(published, le
 @pytest.mark.slow
 def test_the_command_finetunes_from_a_repository_and_the_run_goes_on_without_it(published, leg, tmp_path):
     cache = {"HF_ENDPOINT": published.url, "HF_HUB_CACHE": str(tmp_path / "c"), "HF_HUB_DISABLE_XET": "1"}
-    words = ["finetune", "--from", REPO, "--data", str(leg), "--freeze-trunk", "--out", str(tmp_path / "run")]
+    data, out = [str(leg), str(make_shards(tmp_path / "foot", "foot", dims=1, seed=5))], tmp_path / "run"
+    words = ["finetune", "--from", REPO, "--data", *data, "--freeze-trunk", "--out", str(out), "--json"]
     done = run_command(tmp_path, *words, *SHORT, env=cache)
-    assert done.returncode == 0 and "trunk frozen" in done.stderr, done.stderr
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(done.stdout)
+    assert facts["step"] == 4 and "trunk frozen" in done.stderr and "new stem and head: " in done.stderr
+    assert Checkpoint.open(facts["checkpoint"]).embodiments == ("foot", "leg")
     asked = len(published.log)
-    assert tune(REPO, leg, tmp_path / "run").step == 4 and len(published.log) == asked
+    again = finetune(REPO, data, out=out, freeze_trunk=True, overrides=SHORT, show=False)
+    assert again.step == 4 and len(published.log) == asked

@@ -7,14 +7,11 @@ import torch
 
 from hma_data.errors import RecipeError
 from hma_data.loading.dataset import Batch
-from hma_data.tokenizers.base import TokenizerSpec
-from hma_model.network.stem import from_digits, split_tokens
 from hma_model.training.loop import train
 from hma_model.training.parallel import Ranks
 from hma_model.training.recipe import make_recipe
 from hma_model.training.run import Run
-from hma_model.training.scheduled_sampling import SAMPLE_STEPS, _predicted, forwarded
-from tests.model.network_parts import small_batch, small_model
+from hma_model.training.scheduled_sampling import SAMPLE_STEPS, forwarded
 from tests.model.robots import CONFIG, make_model
 from tests.model.runs import TINY
 from tests.model.shards import make_shards
@@ -23,14 +20,14 @@ FRAMES = 6
 ROBOTS = {"arm": 2, "hand": 3}
 
 
-def batch(size: int = 4, continuous: bool = False) -> Batch:
+def batch(size: int = 4, continuous: bool = False, grid: tuple[int, int] = (2, 3)) -> Batch:
     g = torch.Generator().manual_seed(0)
     names = ["arm", "hand"] * (size // 2)
     actions = torch.randn(size, FRAMES, 6, generator=g)
     known = torch.ones(size, FRAMES, dtype=torch.bool)
     if continuous:
         return Batch(names, actions, known, latents=torch.randn(size, FRAMES, 2, 4, 4, generator=g))
-    return Batch(names, actions, known, tokens=torch.randint(64, (size, FRAMES, 2, 3), generator=g))
+    return Batch(names, actions, known, tokens=torch.randint(64, (size, FRAMES, *grid), generator=g))
 
 
 @pytest.fixture
@@ -118,18 +115,15 @@ def test_no_loss_is_due_on_padded_frames(model):
     assert not output.masked[0, 3:].any() and output.masked[1, 3:].any()
 
 
-def test_a_run_pads_short_episodes_when_asked(tmp_path):
-    spec = TokenizerSpec(
-        name="raw", version=1, kind="discrete", image_size=16, grid=(2, 3), vocab_size=64, factored=(8, 8)
-    )
-    data = [str(make_shards(tmp_path / "arm", "arm", spec=spec, length=6, episodes=8))]
-    recipe = make_recipe({**TINY, "data": data, "short": "pad", "eval_every": 0, "steps": 2})
-    assert train(recipe, out=tmp_path / "run", show=False).step == 2
-
-
 CONTINUOUS = {
     "kind": "continuous", "grid": (4, 4), "channels": 2, "patch": 2, "diffusion_width": 16,
     "diffusion_depth": 1, "latent_scale": 0.5,
+}  # fmt: skip
+
+
+DISCRETE = {
+    "discrete": {}, "chain": {"digit_order": "chain"}, "copies": {"copy_previous": True},
+    "squares": {"merge": 2, "grid": (2, 4)},
 }  # fmt: skip
 
 
@@ -138,6 +132,9 @@ CONTINUOUS = {
     [
         ("discrete", "previous", 0),
         ("discrete", "current", 1),
+        ("chain", "previous", 0),
+        ("copies", "previous", 1),
+        ("squares", "current", 0),
         ("noise", "previous", 2),
         ("noise", "current", 1),
         ("velocity", "previous", 1),
@@ -146,8 +143,8 @@ CONTINUOUS = {
 def test_a_past_of_its_own_is_what_generation_makes_of_the_same_prompt_and_actions(
     kind, alignment, seed, monkeypatch
 ):
-    continuous = kind != "discrete"
-    own = {**CONTINUOUS, "diffusion_target": kind} if continuous else {}
+    continuous = kind in ("noise", "velocity")
+    own = {**CONTINUOUS, "diffusion_target": kind} if continuous else DISCRETE[kind]
     config = CONFIG.replace(frames=FRAMES, action_alignment=alignment, **own)
     model = make_model(ROBOTS, seed=seed, config=config).train()
     torch.manual_seed(seed)
@@ -155,7 +152,7 @@ def test_a_past_of_its_own_is_what_generation_makes_of_the_same_prompt_and_actio
         for parameter in model.parameters():
             parameter.add_(0.2 * torch.randn_like(parameter))
     monkeypatch.setattr("hma_model.network.head.randn", lambda shape, *_: torch.full(tuple(shape), 0.3))
-    true, depth = batch(4, continuous), 1 + seed
+    true, depth = batch(4, continuous, config.grid), 1 + seed
     stored = true.latents if continuous else true.tokens
     given = forwarded(model, true, 1.0, depth, torch.Generator().manual_seed(seed))
     model.eval()
@@ -189,34 +186,6 @@ def test_targets_of_a_continuous_model_are_the_true_latents_whatever_it_sees(tar
     for seen in (given, true):
         model(seen, "forward", torch.Generator().manual_seed(5))
     assert torch.equal(targets[0], targets[1])
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [{}, {"digit_order": "chain"}, {"copy_previous": True}, {"merge": 2, "factored": (6, 4)}],
-    ids=str,
-)
-def test_a_predicted_frame_has_the_likeliest_digits_of_that_frame_masked(changes):
-    model = small_model(**changes)
-    given, rows = small_batch(model.config, ["arm", "hand.v1", "arm"]), torch.tensor([2, 1])
-    made = _predicted(model, given, given.tokens[:, :4], rows, None)
-    hidden = given.tokens[rows, :4]
-    hidden[:, 3] = model.config.vocab_size
-    scores = model.video_logits(hidden, given.actions[rows], ["arm", "hand.v1"], given.action_mask[rows])
-    likeliest = from_digits(scores.argmax(-1), model.config.digits)[:, 3:].flatten(2)
-    expected = split_tokens(likeliest, model.config.merge, model.config.vocab_size, model.config.token_grid)
-    assert torch.equal(made, expected[:, 0])
-
-
-def test_one_that_knows_the_frames_already_gives_the_very_batch(model, monkeypatch):
-    true = batch()
-
-    def known(of, batch, context, rows, generator):
-        return true.tokens[rows, context.shape[1] - 1]
-
-    monkeypatch.setattr("hma_model.training.scheduled_sampling._predicted", known)
-    given = forwarded(model, true, 1.0, 3, torch.Generator().manual_seed(3))
-    assert torch.equal(given.context, true.tokens)
 
 
 def test_no_gradient_flows_through_the_past_and_the_draws_of_training_stay_as_they_were(model):

@@ -229,10 +229,6 @@ def test_auto_takes_bf16_on_a_processor_that_has_it_from_some_width_on(network, 
     assert precision == chosen and why in reason
 
 
-def test_auto_takes_fp32_where_the_processor_has_no_bfloat16(no_bfloat16):
-    assert choose_precision(AUTO, HMAConfig(), CPU) == ("fp32", "this processor does not support bf16")
-
-
 def test_auto_takes_fp32_where_products_of_bfloat16_are_no_faster(bfloat16, monkeypatch):
     monkeypatch.setattr(runtime, "bfloat16_pays", lambda: False)
     precision, reason = choose_precision(AUTO, HMAConfig(width=256), CPU)
@@ -307,16 +303,6 @@ def test_only_matrices_decay():
         assert decay == (0.0 if vector or ".digits." in name else 0.1), name
 
 
-def test_frozen_parameters_are_left_out():
-    model = make_model(ROBOTS)
-    model.trunk.requires_grad_(False)
-    assert not any(name.startswith("trunk.") for name in by_name(model))
-
-
-def test_without_mup_every_group_has_the_same_lr():
-    assert {lr for lr, _ in by_name(make_model(ROBOTS)).values()} == {1.0}
-
-
 def test_mup_scales_what_grows_in_both_directions_and_keeps_lr_times_decay():
     model = make_model(ROBOTS, config=CONFIG.replace(mup=True, base_width=4))
     found = by_name(model)
@@ -327,9 +313,15 @@ def test_mup_scales_what_grows_in_both_directions_and_keeps_lr_times_decay():
     assert found["trunk.position"] == (1.0, 0.0)
 
 
-@pytest.mark.parametrize("width", [32, 128])
-def test_at_its_base_width_mup_changes_no_rate(width):
-    model = make_model({"arm": 2}, config=CONFIG.replace(mup=True, width=width, base_width=width))
+def test_frozen_parameters_are_left_out():
+    model = make_model(ROBOTS)
+    model.trunk.requires_grad_(False)
+    assert not any(name.startswith("trunk.") for name in by_name(model))
+
+
+@pytest.mark.parametrize("changes", [{}, *({"mup": True, "width": n, "base_width": n} for n in (32, 128))])
+def test_without_mup_and_at_its_base_width_every_group_has_the_same_lr(changes):
+    model = make_model({"arm": 2}, config=CONFIG.replace(**changes))
     assert {lr for lr, _ in by_name(model).values()} == {1.0}
 
 
