@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from hma_data.errors import UsageError
 from hma_data.storage.files import file_sha256
-from hma_model.evaluation.metrics import perplexity, psnr, ssim, token_hits, token_nats
+from hma_model.evaluation.metrics import perplexity, psnr, ssim
 from hma_model.evaluation.perceptual import (
     FeatureCollector,
     Moments,
@@ -178,27 +178,6 @@ def test_pictures_of_different_size_are_refused(pictures):
     truth, other = pictures
     with pytest.raises(UsageError, match="must both be"):
         psnr(truth, other[:, :-1])
-
-
-def test_nats_are_those_of_the_joint_distribution():
-    torch.manual_seed(0)
-    logits = torch.randn(6, 2, 4)
-    tokens = torch.arange(6) * 2 + 1
-    low, high = logits.log_softmax(-1).unbind(1)
-    joint = (high[:, :, None] + low[:, None, :]).flatten(1)
-    expected = -joint.gather(1, tokens[:, None])[:, 0]
-    torch.testing.assert_close(token_nats(logits, tokens, (4, 4)), expected)
-
-
-def test_a_hit_needs_every_digit():
-    logits = torch.zeros(3, 2, 4)
-    logits[:, 0, 1] = logits[:, 1, 2] = 1.0
-    right = 1 + 4 * 2
-    assert token_hits(logits, torch.tensor([right, right + 1, right + 4]), (4, 4)).tolist() == [
-        True,
-        False,
-        False,
-    ]
 
 
 def test_perplexity_does_not_overflow():

@@ -65,6 +65,13 @@ def disc(tmp_path_factory: pytest.TempPathFactory) -> ShardSet:
     return ShardSet(folder / "shards")
 
 
+def measured(disc: ShardSet, batches: Any, made: Any = None, tokenizer: Any = None) -> Any:
+    """Measure predictions, which are the truth where none are given."""
+    made = made or {"true": [batch.tokens[:, PROMPT:] for batch in batches]}
+    given: Any = {"prompt": PROMPT, "cameras": "first"}
+    return measure_recorded_state(tokenizer or BlockTokenizer(), disc, batches, made, **given)
+
+
 @pytest.mark.slow
 def test_what_is_in_the_picture_is_read_and_the_rest_is_left_out() -> None:
     pictures, parts = scenes(400, 0)
@@ -88,9 +95,7 @@ def test_errors_are_of_the_recorded_steps(disc: ShardSet, monkeypatch: pytest.Mo
     batches = list(windows(disc, "val", 8, 12))
     ahead = [batch.tokens[:, PROMPT:] for batch in batches]  # type: ignore[index]
     made = {"true": ahead, "shuffled": [tokens.roll(1, 0) for tokens in ahead]}
-    found, last = measure_recorded_state(
-        BlockTokenizer(), disc, batches, made, prompt=PROMPT, cameras="first"
-    )
+    found, last = measured(disc, batches, made)
     assert (found["read"], found["of"]) == (2, 4)
     assert [(row["name"], row["unit"]) for row in found["values"]] == [("x", "px"), ("y", "px")]
     assert found["true"] == found["reconstruction"]  # the prediction is the truth
@@ -147,7 +152,7 @@ def test_a_prediction_that_is_not_finite_has_no_error(disc, monkeypatch) -> None
     made[0][0, -1] = torch.nan
     plain = BlockTokenizer()
     plain.decode = lambda tokens: BlockTokenizer().decode(tokens.astype(np.uint32))  # type: ignore[method-assign]
-    found, _ = measure_recorded_state(plain, disc, batches, {"true": made}, prompt=PROMPT, cameras="first")
+    found, _ = measured(disc, batches, {"true": made}, plain)
     assert found["windows"] == 12 and found["copy"]["error_sd"] == 0
     assert found["true"]["error_sd_last"] is None and found["true"]["error_sd_by_frame"][0] == 0
 
@@ -159,10 +164,7 @@ def test_a_set_whose_states_are_all_unknown_in_part_has_no_reader(disc, monkeypa
     )
     assert recorded_state.recorded_reader(BlockTokenizer(), disc, "first", 0) is None
     batches = list(windows(disc, "val", 8, 4))
-    made = {"true": [batch.tokens[:, PROMPT:] for batch in batches]}  # type: ignore[index]
-    found, last = measure_recorded_state(
-        BlockTokenizer(), disc, batches, made, prompt=PROMPT, cameras="first"
-    )
+    found, last = measured(disc, batches)
     assert found["missing"] == "fewer than two recordings of the training split have known states"
     assert np.isnan(last).all()
 
@@ -171,23 +173,18 @@ def test_what_cannot_be_read_off_the_windows_own_pictures_is_left_out(disc, monk
     monkeypatch.setattr(recorded_state, "learn", exact)
     monkeypatch.setattr(Reader, "errors", lambda self, pictures, states: 0 * states + [0.1, 0.6, 0.7, 0.8])
     batches = list(windows(disc, "val", 8, 12))
-    made = {"true": [batch.tokens[:, PROMPT:] for batch in batches]}  # type: ignore[index]
-    found, _ = measure_recorded_state(BlockTokenizer(), disc, batches, made, prompt=PROMPT, cameras="first")
+    found, _ = measured(disc, batches)
     assert [row["name"] for row in found["values"]] == ["x"] and found["copy"]["error_sd"] == pytest.approx(
         0.1
     )
     monkeypatch.setattr(Reader, "errors", lambda self, pictures, states: 0 * states + 0.6)
-    found, last = measure_recorded_state(
-        BlockTokenizer(), disc, batches, made, prompt=PROMPT, cameras="first"
-    )
+    found, last = measured(disc, batches)
     assert "no recorded state can be estimated" in found["missing"] and np.isnan(last).all()
 
 
 def test_too_few_episodes_are_said(disc: ShardSet, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recorded_state, "EPISODES_NEEDED", 100)
-    found, last = measure_recorded_state(
-        BlockTokenizer(), disc, list(windows(disc, "val", 8, 12)), {}, prompt=PROMPT, cameras="first"
-    )
+    found, last = measured(disc, list(windows(disc, "val", 8, 12)))
     assert "too few to read their states, 100 are needed" in found["missing"]
     assert np.isnan(last).all() and last.shape == (12,)
 

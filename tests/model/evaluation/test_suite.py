@@ -141,13 +141,6 @@ def test_parts_of_another_seed_are_other_parts(made, tmp_path) -> None:
         assert len(list((tmp_path / "parts").glob("*.npz"))) == count
 
 
-def test_the_same_seed_gives_the_same_bytes(made: Path, evaluated: list[suite.Part], tmp_path: Path) -> None:
-    for name, parts in (("a", evaluated[:2]), ("b", run(made, tmp_path / "b"))):
-        write_results(parts, tmp_path / name, "hma evaluate")
-    assert (tmp_path / "a/results.json").read_bytes() == (tmp_path / "b/results.json").read_bytes()
-    assert (tmp_path / "a/report.html").read_bytes() == (tmp_path / "b/report.html").read_bytes()
-
-
 def test_the_page_is_one_file_that_shows_each_robot_and_checkpoint(made, evaluated, tmp_path) -> None:
     page = write_results(evaluated, tmp_path, "hma evaluate").read_text()
     assert not re.findall(r'(?:src|href)="(?!data:)', page)
