@@ -2,8 +2,6 @@
 
 import hashlib
 import json
-import os
-import shutil
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -42,17 +40,6 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "model"
 
 
-def states(model) -> dict[str, torch.Tensor]:
-    return {name: value.clone() for name, value in model.state_dict().items()}
-
-
-def test_every_weight_comes_back_bit_for_bit(tmp_path):
-    model = save(tmp_path / "m", ROBOTS)
-    again = checkpoint.load(tmp_path / "m")
-    assert states(again).keys() == states(model).keys()
-    assert all(torch.equal(value, states(again)[name]) for name, value in states(model).items())
-
-
 def test_the_layout_is_the_contracts(folder):
     files = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
     parts = ("stem.safetensors", "head.safetensors", "embodiment.yaml", "stats.json", "card.json")
@@ -72,22 +59,14 @@ def test_the_cards_and_stems_name_the_trunk_by_its_sha256(folder):
 def test_saving_a_loaded_model_gives_the_same_files(folder, tmp_path):
     save(tmp_path / "again", ROBOTS, model=checkpoint.load(folder))
     for path in folder.rglob("*.*"):
-        if path.name != "README.md" and path.is_file():
-            same = (tmp_path / "again" / path.relative_to(folder)).read_bytes() == path.read_bytes()
-            # a stem's metadata has several keys, whose order safetensors leaves open
-            assert same or path.suffix == ".safetensors" or path.name == "card.json", path
-    assert (tmp_path / "again/trunk.safetensors").read_bytes() == (folder / "trunk.safetensors").read_bytes()
+        if path.is_file():
+            assert (tmp_path / "again" / path.relative_to(folder)).read_bytes() == path.read_bytes(), path
 
 
 def test_loading_one_embodiment_reads_no_other(folder):
     for path in (folder / "embodiments/hand.v2").iterdir():
         path.write_bytes(b"not what it should be")
     assert list(checkpoint.load(folder, ["arm"]).embodiments) == ["arm"]
-
-
-def test_an_unknown_embodiment_is_named_with_those_there(folder):
-    with pytest.raises(CheckpointError, match=r"no embodiment 'leg'.*arm, hand\.v2"):
-        checkpoint.load(folder, ["leg"])
 
 
 @pytest.mark.parametrize("name", ["../arm", "arm/../arm", "/etc", "", "a\\b", "..", "a..b"])
@@ -117,17 +96,6 @@ def test_a_configuration_of_colours_that_are_none_names_its_file(folder, colors)
     path.write_text(json.dumps(values))
     with pytest.raises(CheckpointError, match=r"config\.json: does not describe a model: tokenizer: ha?"):
         Checkpoint.open(folder)
-
-
-def test_the_links_of_a_hub_cache_are_followed(folder, tmp_path):
-    snapshot, blobs = tmp_path / "cache/snapshots/abc", tmp_path / "cache/blobs"
-    shutil.copytree(folder, snapshot)
-    blobs.mkdir()
-    for number, path in enumerate(sorted(snapshot.rglob("*.*"))):
-        if path.is_file():
-            path.rename(blobs / str(number))
-            path.symlink_to(os.path.relpath(blobs / str(number), path.parent))
-    assert set(checkpoint.load(snapshot).embodiments) == set(ROBOTS)
 
 
 def test_a_failed_save_leaves_the_older_checkpoint_intact(folder, tmp_path):
@@ -161,12 +129,6 @@ def test_a_model_with_an_embodiment_without_yaml_is_not_saved(tmp_path):
         robots = {"arm": yaml("arm")}
         numbers = {"arm": stats_of(2)}
         checkpoint.save(make_model(ROBOTS), tmp_path / "m", embodiment_yaml=robots, stats=numbers, cards={})
-
-
-def test_a_training_runs_folder_stands_for_its_newest_checkpoint(tmp_path):
-    save(tmp_path / "run/checkpoints/step-00000010", {"arm": 2})
-    newest = save(tmp_path / "run/checkpoints/step-00000020", {"arm": 2}, seed=2)
-    assert torch.equal(checkpoint.load(tmp_path / "run").trunk.position, newest.trunk.position)
 
 
 def test_a_missing_folder_and_an_empty_one_say_so(tmp_path):

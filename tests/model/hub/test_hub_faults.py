@@ -188,19 +188,6 @@ def test_an_embodiment_that_is_not_whole_is_told_before_anything_is_fetched(publ
     assert list(checkpoint.load(hub.pull(REPO, ["hand"])).embodiments) == ["hand"]
 
 
-@pytest.fixture
-def folder(tmp_path: Path, source: Path) -> Path:
-    hub.push(source, tmp_path / "hub", ["arm"])
-    return tmp_path / "hub"
-
-
-def test_an_update_keeps_what_else_is_in_an_embodiments_folder(folder, source):
-    (folder / "embodiments/arm/notes").mkdir()
-    (folder / "embodiments/arm/notes/mine.txt").write_text("kept")
-    hub.push(source, folder)
-    assert (folder / "embodiments/arm/notes/mine.txt").read_text() == "kept"
-
-
 @pytest.mark.parametrize("address", ["s3://", "s3://bucket/hub", "nowhere://a/b"])
 def test_a_store_that_refuses_is_one_line(source, address, monkeypatch, tmp_path):
     import s3fs
