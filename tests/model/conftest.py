@@ -10,12 +10,16 @@ from pathlib import Path
 import pytest
 import torch
 
+from hma_data.tokenizers.base import get_tokenizer
+from hma_model.network.model import HMA
+from hma_model.simulate import World
 from hma_model.training.loop import TrainResult, train
 from hma_model.training.recipe import Recipe, make_recipe
 from tests.hub_state import ROBOTS
 from tests.model.robots import save
 from tests.model.runs import TINY
 from tests.model.shards import make_shards
+from tests.model.true_world import tiny_model
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -25,6 +29,17 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def model() -> HMA:
+    """A tiny untrained model of a laboratory robot; modules may have their own, and worlds of these."""
+    return tiny_model("rails_03")
+
+
+@pytest.fixture
+def world(model: HMA) -> World:
+    return World(model, get_tokenizer("fsq-8"))
 
 
 @pytest.fixture(scope="session")

@@ -6,26 +6,28 @@ import numpy as np
 import onnx
 import onnxruntime as ort
 import pytest
-from onnx import TensorProto, helper, numpy_helper
+from onnx import helper, numpy_helper
 
 from hma_model.export.files import _pad
 from hma_model.export.winograd import rewrite
 
 
 def model_of(
-    kernel: np.ndarray, sides: tuple[int, int], *, bias: bool = True, **given: object
+    kernel: np.ndarray, sides: tuple[int, int], *, bias: bool = True, times: int = 1, **given: object
 ) -> onnx.ModelProto:
-    helper = onnx.helper
-    inputs = ["image", "kernel", *["bias"] * bias]
-    weights = {"kernel": kernel, "bias": np.linspace(-1, 1, len(kernel), dtype=np.float32)}
-    node = helper.make_node("Conv", inputs, ["out"], **({"pads": [1] * 4} | given))
+    """Convolutions in a row that share their weights."""
+    weights = {"kernel": kernel}
+    if bias:
+        weights["bias"] = np.linspace(-1, 1, len(kernel), dtype=np.float32)
+    names, how = ["image", *(f"out{i}" for i in range(times))], {"pads": [1] * 4} | given
+    nodes = [helper.make_node("Conv", [one, *weights], [other], **how) for one, other in pairwise(names)]
     shape = [1, kernel.shape[1] * int(str(given.get("group", 1))), *sides]
     graph = helper.make_graph(
-        [node],
+        nodes,
         "one",
         [helper.make_tensor_value_info("image", onnx.TensorProto.FLOAT, shape)],
-        [helper.make_tensor_value_info("out", onnx.TensorProto.FLOAT, [None] * 4)],
-        [onnx.numpy_helper.from_array(weights[name], name) for name in inputs[1:]],
+        [helper.make_tensor_value_info(names[-1], onnx.TensorProto.FLOAT, [None] * 4)],
+        [numpy_helper.from_array(value, name) for name, value in weights.items()],
     )
     return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=9)
 
@@ -73,40 +75,21 @@ KERNEL = DRAW.normal(size=(6, 6, 3, 3)).astype(np.float32)
 IMAGE = DRAW.normal(size=(1, 6, 8, 8)).astype(np.float32)
 
 
-def graph(kernel: np.ndarray, group: int = 1, times: int = 2) -> onnx.ModelProto:
-    """Convolutions in a row that share a weight."""
-    names = ["x", *(f"y{i}" for i in range(times))]
-    nodes = [
-        helper.make_node("Conv", [one, "w"], [other], pads=[1, 1, 1, 1], group=group)
-        for one, other in pairwise(names)
-    ]
-    x, y = (
-        helper.make_tensor_value_info(one, TensorProto.FLOAT, IMAGE.shape) for one in (names[0], names[-1])
-    )
-    made = helper.make_graph(nodes, "g", [x], [y], [numpy_helper.from_array(kernel, "w")])
-    return helper.make_model(made, opset_imports=[helper.make_opsetid("", 18)], ir_version=8)
-
-
-def made_by(model: onnx.ModelProto) -> np.ndarray:
-    onnx.checker.check_model(model, full_check=True)
-    session = ort.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
-    return session.run(None, {"x": IMAGE})[0]
-
-
 def test_convolutions_that_share_a_weight_compute_the_same() -> None:
-    model = graph(KERNEL)
-    before = made_by(model)
+    model = model_of(KERNEL, (8, 8), bias=False, times=2)
+    before = run(model, IMAGE)
     _pad(model)
+    onnx.checker.check_model(model, full_check=True)
     shapes = [numpy_helper.to_array(one).shape for one in model.graph.initializer if one.data_type == 1]
     assert shapes == [(6, 8, 3, 3)]  # the unpadded weight is gone
-    np.testing.assert_allclose(made_by(model), before, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(run(model, IMAGE), before, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize(
     ("kernel", "group"), [(KERNEL[:, :, :1, :1], 1), (KERNEL[:, :3], 2), (KERNEL[:, :1], 6)]
 )
 def test_what_is_computed_rightly_stays(kernel: np.ndarray, group: int) -> None:
-    model = graph(kernel, group, times=1)
+    model = model_of(kernel, (8, 8), bias=False, group=group)
     before = model.SerializeToString()
     _pad(model)
     assert model.SerializeToString() == before

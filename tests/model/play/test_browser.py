@@ -281,20 +281,6 @@ def test_replay_follows_the_recorder_until_a_person_takes_over(page: "Page", ste
     assert not session.replays
 
 
-def test_two_pages_drive_robots_of_their_own(page, browser, address, stepper) -> None:
-    context = browser.new_context()
-    other = opened(context.new_page(), address, "arm4_04")
-    other.wait_for_selector("#dim-4")
-    for one in (page, other):
-        one.keyboard.press("p")
-    frames(page, 4)
-    frames(other, 4)
-    assert session_of(stepper, page) is not session_of(stepper, other)
-    context.close()
-    count = session_of(stepper, page).count
-    frames(page, count + 3)
-
-
 def test_a_reload_goes_on_where_it_was(page: "Page", stepper: Stepper) -> None:
     page.keyboard.down("ArrowUp")
     frames(page, 4)
@@ -307,14 +293,6 @@ def test_a_reload_goes_on_where_it_was(page: "Page", stepper: Stepper) -> None:
     assert session_of(stepper, page) is session
     page.keyboard.press("p")
     frames(page, session.count + 2)
-
-
-def test_a_drive_is_downloaded(page: "Page") -> None:
-    page.click("#run")
-    frames(page, 3)
-    with page.expect_download() as download:
-        page.click("[data-save=mp4]")
-    assert download.value.suggested_filename == "mover_04-scene-0.mp4"
 
 
 def test_a_file_that_is_prepared_says_how_far_it_is_and_the_page_goes_on(page, monkeypatch) -> None:
@@ -403,20 +381,6 @@ def test_two_fingers_drive_two_sliders(browser: "Browser", address: str, stepper
     context.close()
 
 
-def test_the_page_says_when_model_and_truth_part_and_sync_helps(page: "Page", stepper: Stepper) -> None:
-    session = session_of(stepper, page)
-    stepper.call(lambda: session.world.blind.add(session.row)).result(10)  # type: ignore[attr-defined]
-    page.locator("input[value=fast]").check(force=True)
-    page.click("#run")
-    page.wait_for_selector("#parted:has-text('diverged at 0.1 s')")
-    assert "Sync restarts the model" in (page.text_content("#note") or "")
-    assert page.get_attribute("#sync", "class") == "call"
-    stepper.call(lambda: session.world.blind.clear()).result(10)  # type: ignore[attr-defined]
-    page.keyboard.press("y")
-    page.wait_for_selector("#parted:has-text('parted')", state="hidden")
-    page.wait_for_selector("#sync:not(.call)")
-
-
 def test_the_border_warns_when_the_calibrated_uncertainty_does(page, stepper, monkeypatch) -> None:
     assert page.text_content("#meter") == "no error meter"
     assert page.get_attribute("#meter", "title") == "it is never unsure"
@@ -443,12 +407,14 @@ def test_the_border_warns_when_the_calibrated_uncertainty_does(page, stepper, mo
     page.wait_for_selector("#stage:not(.warns)")
 
 
-def test_an_image_that_is_decoded_after_a_sync_does_not_bring_the_parting_back(page, stepper) -> None:
+def test_the_page_says_when_model_and_truth_part_and_not_after_a_sync(page, stepper) -> None:
     session = session_of(stepper, page)
     stepper.call(lambda: session.world.blind.add(session.row)).result(10)  # type: ignore[attr-defined]
     page.locator("input[value=fast]").check(force=True)
     page.click("#run")
     page.wait_for_selector("#parted:has-text('diverged at 0.1 s')")
+    assert "Sync restarts the model" in (page.text_content("#note") or "")
+    assert page.get_attribute("#sync", "class") == "call"
     page.keyboard.press("p")
     page.wait_for_selector("#run:has-text('Run')")
     page.evaluate("""() => {

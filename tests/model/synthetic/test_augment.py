@@ -178,21 +178,19 @@ def test_noise_without_a_share_is_refused(words: str, world: World, tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_first_frames_and_actions_come_from_shards(world: World, tmp_path: Path) -> None:
-    recording = record(ROBOT, tmp_path, 1)
-    convert(family.embodiment(ROBOT), recording, world.tokenizer, tmp_path / "real")
-    augment(tmp_path / "out", asked(source="real", episodes=2), world=world, shards=tmp_path / "real")
+def test_first_frames_and_actions_come_from_shards(world: World, real: Path, tmp_path: Path) -> None:
+    augment(tmp_path / "out", asked(source="real", episodes=2), world=world, shards=real)
     assert verify(tmp_path / "out") == []
-    real, made = episodes(tmp_path / "real"), ShardSet(tmp_path / "out").episodes.to_pylist()
+    (recorded,), made = episodes(real), ShardSet(tmp_path / "out").episodes.to_pylist()
     assert {row["group"] for row in made} == {"demo_0"}
     stride = world.model.embodiments[ROBOT].stride
     for columns in episodes(tmp_path / "out"):
-        tokens, length = real[0]["tokens"], len(columns["action"])
+        tokens, length = recorded["tokens"], len(columns["action"])
         starts = [at for at, frame in enumerate(tokens) if np.array_equal(frame, columns["tokens"][0])]
-        rows = [real[0]["action"][at : at + length * stride].ravel() for at in starts]
+        rows = [recorded["action"][at : at + length * stride].ravel() for at in starts]
         assert any(np.array_equal(one, columns["action"].ravel()) for one in rows)
     with pytest.raises(UsageError, match="has no episode of 2 \\+ 900 frames"):
-        augment(tmp_path / "no", asked(frames=900), world=world, shards=tmp_path / "real")
+        augment(tmp_path / "no", asked(frames=900), world=world, shards=real)
 
 
 @pytest.mark.slow

@@ -30,6 +30,7 @@ from tests.model.shards import state_pauses
 from tests.model.true_world import BlockLatents, tiny_model, trained_on
 
 ROBOT = "rails_03"
+KNOWN = labels.LabelError("s", "val", ("a",), (0.1,), (1.0,), (None,), 9)
 
 
 @pytest.fixture(autouse=True)
@@ -175,9 +176,7 @@ def test_film_that_cannot_be_read_goes_to_quarantine(world, real, tmp_path, monk
     (places / "cut.mp4").write_bytes(whole[: len(whole) // 2])
     (places / "none.mp4").write_bytes(b"")
     write_mp4(places / "one.mp4", [np.zeros((96, 128, 3), np.uint8)], 10)
-    monkeypatch.setattr(
-        labels, "measure", lambda *_: labels.LabelError("s", "val", ("a",), (0.1,), (1.0,), (None,), 9)
-    )
+    monkeypatch.setattr(labels, "measure", lambda *_: KNOWN)
     found = label_actions(places, tmp_path / "out", ROBOT, checkpoint="", check=real, world=world)
     assert found.manifest.quarantined == 3 and verify(tmp_path / "out") == []
     said = (tmp_path / "out" / "quarantine.jsonl").read_text()
@@ -201,8 +200,7 @@ def shown(world: World, out: Path) -> dict[str, int]:
 
 
 def test_film_that_has_grown_or_changed_is_never_taken_for_what_was_labelled(world, tmp_path, monkeypatch):
-    known = labels.LabelError("s", "val", ("a",), (0.1,), (1.0,), (None,), 9)
-    monkeypatch.setattr(labels, "measure", lambda *_: known)
+    monkeypatch.setattr(labels, "measure", lambda *_: KNOWN)
     monkeypatch.setattr(labels, "_check_set", lambda *_: None)
     labelled = list[int]()
 
@@ -279,8 +277,7 @@ def test_film_that_pauses_is_labelled_in_parts(three: ShardSet, tmp_path: Path) 
 @pytest.mark.parametrize("three", [BlockTokenizer], indirect=True)
 def test_labelled_shards_name_the_cameras_that_their_images_are_of(three, views, tmp_path, monkeypatch):
     monkeypatch.setattr(labels, "yaml_of", generation_commands.yaml_of)
-    known = labels.LabelError("s", "val", ("a",), (0.1,), (1.0,), (None,), 9)
-    monkeypatch.setattr(labels, "measure", lambda *_: known)
+    monkeypatch.setattr(labels, "measure", lambda *_: KNOWN)
     world: Any = World(trained_on(views, three, tmp_path / "model", "inverse").model, BlockTokenizer())
     given: Any = {"checkpoint": "", "check": three.folder, "world": world}
     label_actions(three.folder, tmp_path / "out", three.embodiment.id, **given)

@@ -43,6 +43,11 @@ def prompt(window: tuple[Any, Any]) -> dict[str, Any]:
     return {"frames": window[0], "chunks": window[1]}
 
 
+@pytest.fixture
+def how(world: World, window: tuple[Any, Any]) -> dict[str, Any]:
+    return {"embodiment": PUSH, "world": world, "prompt": prompt(window)}
+
+
 def actions(count: int, *shape: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(60, 450, (count, *shape, 2)).astype(np.float32)
 
@@ -63,15 +68,8 @@ def test_gymnasium_finds_nothing_wrong(control: str, window: tuple[Any, Any]) ->
 
 
 @pytest.mark.parametrize("control", ["frame", "chunk"])
-def test_steps_show_what_the_world_shows(world: World, window: tuple[Any, Any], control: str) -> None:
-    env = WorldModelEnv(
-        embodiment=PUSH,
-        world=world,
-        prompt=prompt(window),
-        control=control,
-        horizon=4,
-        render_mode="rgb_array",
-    )
+def test_steps_show_what_the_world_shows(world, window, how, control: str) -> None:
+    env = WorldModelEnv(**how, control=control, horizon=4, render_mode="rgb_array")
     first, _ = env.reset(seed=3)
     chunks = actions(2, 2)
     session = world.open(PUSH, *window, seed=world._sessions[env.session].seed)  # type: ignore[index]
@@ -88,14 +86,14 @@ def test_steps_show_what_the_world_shows(world: World, window: tuple[Any, Any], 
     assert np.array_equal(env.render(), made[-1])  # type: ignore[arg-type]
 
 
-def test_a_judge_sees_the_episode_and_ends_it(world: World, window: tuple[Any, Any]) -> None:
+def test_a_judge_sees_the_episode_and_ends_it(how: dict[str, Any]) -> None:
     shapes = []
 
     def judge(images: np.ndarray, actions: np.ndarray) -> tuple[float, bool]:
         shapes.append((images.shape, actions.shape))
         return float(actions[-1, 0, 0]), len(actions) == 2
 
-    env = WorldModelEnv(embodiment=PUSH, world=world, prompt=prompt(window), control="chunk", judge=judge)
+    env = WorldModelEnv(**how, control="chunk", judge=judge)
     chunks = actions(2, 2)
     for _ in range(2):
         env.reset(seed=0)
@@ -132,11 +130,8 @@ def test_a_vector_steps_as_gymnasium_steps_environments_one_by_one(model, window
     assert 3 < ends < 24
 
 
-def test_a_vector_without_autoreset_starts_those_that_are_asked_for(world, window) -> None:
-    env = WorldModelVectorEnv(
-        2, embodiment=PUSH, world=world, prompt=prompt(window), control="chunk", horizon=2,
-        autoreset_mode="Disabled",
-    )  # fmt: skip
+def test_a_vector_without_autoreset_starts_those_that_are_asked_for(how: dict[str, Any]) -> None:
+    env = WorldModelVectorEnv(2, **how, control="chunk", horizon=2, autoreset_mode="Disabled")
     first, _ = env.reset(seed=0)
     chunks = actions(3, 2, 2)
     env.step(chunks[0])
@@ -146,9 +141,7 @@ def test_a_vector_without_autoreset_starts_those_that_are_asked_for(world, windo
     assert env.step(chunks[1])[3].tolist() == [False, True]
     with pytest.raises(HMAError, match=r"the episodes of \[1\] have ended"):
         env.step(chunks[2])
-    made = gymnasium.make_vec(
-        "hma/WorldModel-v0", 2, "vector_entry_point", embodiment=PUSH, world=world, prompt=prompt(window)
-    )
+    made = gymnasium.make_vec("hma/WorldModel-v0", 2, "vector_entry_point", **how)
     assert isinstance(made, WorldModelVectorEnv) and made.reset()[0].shape == (2, 64, 64, 3)
 
 
@@ -176,15 +169,8 @@ def test_a_policy_of_gym_pusht_runs_unchanged(world: World) -> None:
     assert min(moved) > 0.1 and np.abs(images[0][0].astype(int) - images[1][0]).mean() < 12
 
 
-def test_gymnasium_records_a_film_of_the_images(world, window, tmp_path) -> None:
-    env: Any = WorldModelEnv(
-        embodiment=PUSH,
-        world=world,
-        prompt=prompt(window),
-        control="chunk",
-        horizon=2,
-        render_mode="rgb_array",
-    )
+def test_gymnasium_records_a_film_of_the_images(how, tmp_path) -> None:
+    env: Any = WorldModelEnv(**how, control="chunk", horizon=2, render_mode="rgb_array")
     env = RecordVideo(env, str(tmp_path), episode_trigger=lambda number: True)
     env.reset(seed=0)
     images = [env.step(chunk)[0] for chunk in actions(2, 2)]
@@ -195,9 +181,9 @@ def test_gymnasium_records_a_film_of_the_images(world, window, tmp_path) -> None
     assert np.abs(np.stack(frames[1:]) - np.stack(images).astype(float)).mean() < 6
 
 
-def test_actions_outside_the_training_range_warn_once_and_are_clipped_only_if_asked(world, window) -> None:
-    how: dict[str, Any] = {"embodiment": PUSH, "world": world, "prompt": prompt(window), "control": "chunk"}
+def test_actions_outside_the_training_range_warn_once_and_are_clipped_only_if_asked(world, how) -> None:
     wild, edge = np.full((2, 2), 700.0), np.tile(world.action_spec(PUSH).seen[1], (2, 1))  # type: ignore[index]
+    how["control"] = "chunk"
     free, clipped, at_edge = (WorldModelEnv(**how, clip=clip) for clip in (False, True, False))
     for env in (free, clipped, at_edge):
         env.reset(seed=0)
@@ -210,8 +196,8 @@ def test_actions_outside_the_training_range_warn_once_and_are_clipped_only_if_as
     assert np.array_equal(*images)
 
 
-def test_an_unknown_action_is_nan(world: World, window: tuple[Any, Any]) -> None:
-    env = WorldModelEnv(embodiment=PUSH, world=world, prompt=prompt(window))
+def test_an_unknown_action_is_nan(world: World, window: tuple[Any, Any], how: dict[str, Any]) -> None:
+    env = WorldModelEnv(**how)
     env.reset(seed=0)
     session = world.open(PUSH, *window, seed=world._sessions[env.session].seed)  # type: ignore[index]
     one = np.array([300.0, 200.0])
@@ -228,8 +214,8 @@ def test_an_unknown_action_is_nan(world: World, window: tuple[Any, Any]) -> None
         (np.array([np.inf, 1.0]), "not finite"),
     ],
 )
-def test_bad_actions_are_refused_and_the_episode_goes_on(world, window, action, message) -> None:
-    env = WorldModelEnv(embodiment=PUSH, world=world, prompt=prompt(window))
+def test_bad_actions_are_refused_and_the_episode_goes_on(how, action, message) -> None:
+    env = WorldModelEnv(**how)
     with pytest.raises(HMAError, match=re.escape("call reset() first")):
         env.step(np.zeros(2))
     env.reset()
@@ -238,8 +224,8 @@ def test_bad_actions_are_refused_and_the_episode_goes_on(world, window, action, 
     env.step(np.array([100.0, 100.0]))
 
 
-def test_an_action_that_is_refused_leaves_no_environment_of_a_vector_ahead(world, window) -> None:
-    envs = WorldModelVectorEnv(2, embodiment=PUSH, world=world, prompt=prompt(window))
+def test_an_action_that_is_refused_leaves_no_environment_of_a_vector_ahead(how: dict[str, Any]) -> None:
+    envs = WorldModelVectorEnv(2, **how)
     envs.reset(seed=1)
     given = actions(4, 2)
     envs.step(given[0])

@@ -186,11 +186,16 @@ def test_another_robot_needs_a_prompt() -> None:
         starting_window(small_model(), "arm")
 
 
-def test_a_recorded_robot_starts_from_no_episode_that_is_too_short(tmp_path: Path) -> None:
+@pytest.fixture
+def recorded(tmp_path: Path) -> tuple[ShardSet, HMA]:
     shards = ShardSet(make_shards(tmp_path / "shards", RECORDED, episodes=6, held_out=2))
-    folder = tmp_path / "run" / "checkpoints" / "step-00000001"
-    model = trained_on("first", shards, folder).model
+    (tmp_path / "run").mkdir()
     (tmp_path / "run" / "recipe.json").write_text(json.dumps({"data": [str(shards.folder)]}))
+    return shards, trained_on("first", shards, tmp_path / "run/checkpoints/step-00000001").model
+
+
+def test_a_recorded_robot_starts_from_no_episode_that_is_too_short(recorded: tuple[ShardSet, HMA]) -> None:
+    shards, model = recorded
     names = [row["id"] for row in shards.episodes.to_pylist()]
     short = {7: 9, 15: 9}  # pauses that leave pieces of eight rows; a prompt takes eleven
 
@@ -209,11 +214,8 @@ def test_a_recorded_robot_starts_from_no_episode_that_is_too_short(tmp_path: Pat
         started(0)
 
 
-def test_a_recorded_robot_starts_from_the_held_out_episodes_of_its_training(tmp_path: Path) -> None:
-    shards = ShardSet(make_shards(tmp_path / "shards", RECORDED, episodes=6, held_out=2))
-    folder = tmp_path / "run" / "checkpoints" / "step-00000001"
-    model = trained_on("first", shards, folder).model
-    (tmp_path / "run" / "recipe.json").write_text(json.dumps({"data": [str(shards.folder)]}))
+def test_a_recorded_robot_starts_from_the_held_out_episodes_of_its_training(recorded) -> None:
+    shards, model = recorded
     held = [row["id"] for row in shards.episodes.to_pylist() if row["split"] == "val"]
     for seed, name in enumerate([*held, held[0]]):
         own = starting_window(model, RECORDED, seed)
