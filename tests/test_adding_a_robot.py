@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from tests.command import hma
+from tests.command import fails, hma
 from tests.data.bag_files import make_recording, write_ros2
 from tests.data.videos import make_v3
 
@@ -53,11 +53,14 @@ def test_a_robot_goes_from_a_recording_to_the_hub_by_its_yaml_alone(make, tmp_pa
     asked = hma("registry", "validate", str(path), cwd=tmp_path)
     assert asked.returncode == 1 and "still TODO" in asked.stdout
     answer(tmp_path / path)
+    fails(hma("registry", "infer", data, "--id", "friday", "--out", path, cwd=tmp_path), 1, "exists")
     run("registry", "validate", path)
     assert "friday" in run("registry", "list", "friday")
     hma("inspect", str(data), "-e", "friday", cwd=tmp_path)
     run("convert", "-e", "friday", "--tokenizer", "fsq-8", "--workers", "0", "--out", "shards")
     run("shards", "verify", "shards")
+    run("shards", "preview", "shards", "--out", "seen")
+    assert all((tmp_path / "seen" / name).stat().st_size > 1000 for name in ("sheet.png", "preview.mp4"))
     facts = json.loads(run("shards", "info", "shards", "--json"))
     assert facts["totals"]["episodes"] == 3 and facts["totals"]["quarantined"] == 0
     run("train", "discrete_tiny", "data=[shards]", *TINY, "--out", "run")

@@ -98,41 +98,6 @@ def test_only_a_training_command_with_a_process_of_its_own_keeps_freed_memory(mo
     assert asked == ["train", "finetune"]
 
 
-def test_the_whole_data_road_on_a_toy_recording(toy_yaml: Path, tmp_path: Path) -> None:
-    out = tmp_path / "shards"
-    source = str(tmp_path / "toy.hdf5")
-    words = ("convert", "-e", toy_yaml, "--source", source, "--tokenizer", "raw-64", "--out", out, "--json")
-    made = hma(*words)
-    assert made.returncode == 0, made.stderr
-    assert json.loads(made.stdout)["episodes"] == 3
-    assert json.loads(hma(*words).stdout)["shards_made"] == 0
-    assert hma("shards", "verify", str(out)).returncode == 0
-    assert json.loads(hma("shards", "info", str(out), "--json").stdout)["totals"]["frames"] == 45
-    rows = json.loads(hma("mixture", str(out), "--frames", "4", "--json").stdout)["embodiments"]
-    assert rows[0]["probability"] == 1
-    assert hma("shards", "preview", str(out), "--out", str(tmp_path / "seen")).returncode == 0
-    assert (tmp_path / "seen" / "sheet.png").stat().st_size > 1000
-    assert (tmp_path / "seen" / "preview.mp4").stat().st_size > 1000
-
-
-def test_infer_writes_a_yaml_whose_questions_validate_lists(toy_yaml: Path, tmp_path: Path) -> None:
-    out = tmp_path / "mine.yaml"
-    assert hma("registry", "infer", tmp_path / "toy.hdf5", "--id", "mine", "--out", out).returncode == 0
-    asked = hma("registry", "validate", str(out))
-    assert asked.returncode == 1
-    assert "frequency_hz: still TODO" in asked.stdout
-    answers = {"frequency_hz: ": "10", "  space: ": "joint_delta", "kind: ": "simulation", "robot: ": "toy"}
-    lines = []
-    for line in out.read_text().splitlines():
-        key = next((k for k in answers if line.startswith(k) and "TODO" in line), None)
-        lines.append(key + answers[key] if key else line.replace("TODO: where is the rate stated?", "me"))
-    out.write_text("\n".join(lines))
-    assert hma("registry", "validate", str(out)).returncode == 0, out.read_text()
-    words = ("--out", tmp_path / "o", "--tokenizer", "fsq-8", "--workers", "0")
-    assert hma("convert", "-e", out, *words).returncode == 0
-    fails(hma("registry", "infer", tmp_path / "toy.hdf5", "--id", "mine", "--out", out), 1, "exists")
-
-
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
