@@ -45,7 +45,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/worlds": (1_478, 11_069, 6),
 }
 PRODUCT_LINES, PRODUCT_NODES = 65_353, 514_473
-TEST_LINES = 48_721
+TEST_LINES = 48_279
 DOC_WORDS = 41_997
 
 
