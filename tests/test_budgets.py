@@ -46,7 +46,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
 }
 PRODUCT_LINES, PRODUCT_NODES = 65_353, 514_473
 TEST_LINES = 48_279
-DOC_WORDS = 41_997
+DOC_WORDS = 41_983
 
 
 @cache

@@ -312,7 +312,7 @@ def _takes_sums(height: int, width: int, inner_h: int, inner_w: int) -> bool:
 
 
 def _resize_by_sums(frame: Images, square: Images) -> None:
-    """Resize a picture (H, W, 3) into (h, w, 3) by exact means, in a third of the time of INTER_AREA."""
+    """Resize a picture (H, W, 3) into (h, w, 3) by exact means, in about half the time of INTER_AREA."""
     cv2, (height, width) = opencv(), square.shape[:2]
     total = _shares(len(frame), height)[0] * _shares(frame.shape[1], width)[0]
     whole = _held("whole", frame.shape, np.uint16)
