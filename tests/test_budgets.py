@@ -23,7 +23,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/loading": (1_278, 10_753, 6),
     "hma_data/registry": (1_268, 8_248, 6),
     "hma_data/shards": (2_494, 19_183, 11),
-    "hma_data/sources": (12_448, 102_168, 51),
+    "hma_data/sources": (12_450, 102_179, 51),
     "hma_data/storage": (1_697, 11_105, 11),
     "hma_data/tokenizers": (3_459, 25_242, 18),
     "hma_model": (564, 3_409, 4),
@@ -44,7 +44,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_670, 30_166, 20),
     "hma_model/worlds": (1_478, 11_069, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_353, 514_473
+PRODUCT_LINES, PRODUCT_NODES = 65_355, 514_484
 TEST_LINES = 48_279
 DOC_WORDS = 41_983
 

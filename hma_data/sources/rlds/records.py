@@ -85,10 +85,12 @@ class RecordFile:
         """
         with self._lock:
             if not (self._frames.whole or 0 <= limit <= len(self._frames)):
-                most = limit if self.blocks else -1
-                with self._parts() as read:
-                    self._frames = scan_tfrecord(read, self._path, self._size, self._frames, most)
+                self._frames = self._scanned(limit)
             return self._frames
+
+    def _scanned(self, limit: int) -> RecordFraming:
+        with self._parts() as read:
+            return scan_tfrecord(read, self._path, self._size, self._frames, limit if self.blocks else -1)
 
     @contextmanager
     def _parts(self) -> Iterator[Read]:
