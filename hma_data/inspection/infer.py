@@ -478,4 +478,7 @@ def _lacks(found: Inspection, fault: str, images: Sequence[KeyInfo]) -> SourceEr
     seen = [f"{key.key} of {key.count} rows" if rows else f"{key.key} {key.shape}" for key in images]
     said = f"{fault}; images: {shown(seen, 4) or 'none'}; numbers: {shown(others) or 'none'}"
     remedy = "record cameras and the robot's actions or joint states together; hma inspect lists every key"
+    unread = next((one for one in found.findings if one.check == "readable" and one.key), None)
+    if unread:  # perhaps it is what lacks
+        said, remedy = f"{said}; {unread.message}", unread.remedy or remedy
     return SourceError(shown([found.uri]), said, remedy)

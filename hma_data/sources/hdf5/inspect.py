@@ -3,6 +3,7 @@
 import re
 from collections import Counter
 from collections.abc import Container, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 
 from hma_data.arrays import Array
 from hma_data.episodes.images import decode_image, image_codec
-from hma_data.errors import EpisodeError
+from hma_data.errors import EpisodeError, HMAError
 from hma_data.registry.components import Hdf5Layout
 from hma_data.sources.common import checks
 from hma_data.sources.common.checks import Finding, is_times, seconds_a_unit
@@ -31,6 +32,7 @@ from hma_data.sources.hdf5.file import (
     is_plausible,
     is_single,
     json_of,
+    masks_of,
     numbers,
     rows,
     text,
@@ -101,6 +103,15 @@ def inspect(uri: str, finder: EpisodeFinder, episodes: int, pattern: str | None 
                 measured = first.facts["rate"].startswith(_MEASURED)
                 source = f"{first.name} at" if measured else "the recording states"
                 survey.look(name, keys, first.rate, source)
+    for file in {found[name].file for name in chosen}:
+        masks: dict[str, set[str]] = {}
+        with suppress(HMAError), explained(file):  # what a damaged file lacks is told of its episodes
+            masks = masks_of(finder.files.get(file))
+        demos = {place.group.rsplit("/", 1)[-1] for place in found.values() if place.file == file}
+        for mask, names in masks.items():
+            if absent := sorted(names - demos):
+                said = f"mask/{mask} names {listed(absent)}, which {file.name} does not have"
+                survey.note(Finding("keys", "warn", said, numbers={"demos": len(absent)}))
     lacking = [key for key, count in held.items() if key not in first.keys and 2 * count >= len(lengths)]
     if lacking:
         survey.note(Finding("keys", "warn", f"{first.name}: has no {listed(lacking)}, which others have"))

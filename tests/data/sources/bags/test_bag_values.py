@@ -10,7 +10,7 @@ import pytest
 from google.protobuf import descriptor_pb2
 from mcap.writer import Writer
 
-from hma_data.errors import EpisodeError
+from hma_data.errors import EpisodeError, SourceError
 from hma_data.inspection.infer import infer
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.bags.container import Channel
@@ -156,6 +156,8 @@ def test_a_topic_of_two_types_is_refused(tmp_path: Path) -> None:
     with pytest.raises(EpisodeError, match=f"{said} — filter the recording to one of them"):
         pairs(path, robot(action="/cmd.position"))
     assert any(said in problem for problem in SOURCE.inspect(str(path)).problems)
+    with pytest.raises(SourceError, match=f"nothing that could be an action.*{said} — filter the recording"):
+        infer(str(path), "x")
 
 
 @pytest.mark.parametrize("unit", [1, 10**3, 10**6, 10**9])

@@ -73,6 +73,13 @@ def test_as_many_observations_as_actions_need_nothing_dropped(tmp_path: Path) ->
     np.testing.assert_array_equal(shown(one(tmp_path, data=pictures()), last_observation="drop"), pictures())
 
 
+def test_a_mask_that_names_an_absent_demo_is_named(tmp_path: Path) -> None:
+    path = linked(tmp_path, h5py.SoftLink("/store/x"))
+    with h5py.File(path, "a") as file:
+        del file["data/demo_1"]
+    assert "mask/train names demo_1, which demo.hdf5 does not have" in problems(path)
+
+
 @pytest.mark.parametrize(
     ("dtype", "pixels", "factor"),
     [
