@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hma_data.arrays import Floats
 from hma_data.errors import UsageError
 from hma_data.lab import truth
 from hma_data.lab.simulator import embodiment
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
 
 MARKS = (1, 6, 20, 60, 100, 300, 1000, 3000)  # frames at which figures are given, and the last
 MOVED = 8.0  # px of 128 from which an object has moved
+HELD_S = 1.2  # seconds that keys are held
 CARD_MARKS = (20, 100)  # frames at which a model card says what is left
 SHEET = (0, 1, 3, 6, 10, 20, 40, 60, 100, 200, 300)  # frames of a sheet; 0 is the prompt's last
 
@@ -79,12 +81,29 @@ def measure(model: "HMA", tokenizer: "Tokenizer", robot: str, settings: dict[str
     stride, length = model.embodiments[robot].stride, prompt + settings["frames"]
     if settings["driver"] == "contact":
         simulated = partial(contact_episode, length, stride, seed)
+    elif settings["driver"] == "keys":
+        simulated = partial(keys_episode, robot, length, stride, seed)
     else:
         simulated = partial(truth.episode, robot, length, stride, seed, wander=settings["driver"] == "wander")
     episodes = [simulated(number) for number in range(settings["rollouts"])]
     found = continued(model, tokenizer, robot, episodes, prompt, seed)
     print(f"{robot}: {time.monotonic() - begun:.0f} s", file=sys.stderr, flush=True)
     return found
+
+
+def keys_episode(robot: str, length: int, stride: int, seed: int, number: int) -> truth.TrueEpisode:
+    """Simulate an episode under actions that are held down, which unlike a driver's press on at limits."""
+    actions = held_keys(robot, length * stride, seed, number)
+    return truth.episode(robot, length, stride, seed, number, commands=actions)
+
+
+def held_keys(robot: str, count: int, seed: int, number: int) -> Floats:
+    """Return actions (count, A) as of a person: each value stays at an end or in the middle for HELD_S."""
+    known, rate = embodiment(robot).action.components, embodiment(robot).rate_hz
+    ranges = [part.range or (-1, 1) for part in known for _ in range(part.dims)]
+    drawn = np.random.default_rng((seed, number)).integers(0, 3, (count, len(ranges)))
+    actions = np.array([np.linspace(*one, 3)[at] for one, at in zip(ranges, drawn.T, strict=True)]).T
+    return np.repeat(actions, round(HELD_S * rate), axis=0)[:count]
 
 
 def record(checkpoint: str, rows: list[dict[str, Any]], rollouts: int) -> None:
@@ -195,7 +214,8 @@ BENCH = Bench(
         "robots": "pusht_fast,arm2_07,mover_10",
         "frames": 60,
         "rollouts": 12,  # of each robot
-        # Of pushers: own pushes the T to its goal, wander moves at random, contact as recipes/lab/pushes.py.
+        # keys: actions held down, also at limits. Of pushers: own pushes the T to its goal, wander moves at
+        # random, contact as recipes/lab/pushes.py.
         "driver": "own",
         "prompt": 3,  # true frames
         "device": "auto",
@@ -204,5 +224,5 @@ BENCH = Bench(
         "record": False,  # write the figures into the cards of the checkpoint's folder
     },
     run,
-    choices={"driver": ("own", "wander", "contact")},
+    choices={"driver": ("own", "keys", "wander", "contact")},
 )

@@ -85,7 +85,7 @@ def counted(episodes: int, report: Report) -> Iterator[int]:
 
 
 def record_pushes(robot: str, folder: Path, episodes: Iterable[int], seed: int) -> Path:
-    """Record a robot of the family that goes to its blocks twice as often as otherwise."""
+    """Record a robot of the family that goes to its blocks twice as often, and holds keys down."""
     body, recording = Body.of(robot), folder / f"{robot}.hdf5"
     with atomic_path(recording) as part:
         demos = (family.episode(body, seed, number, chances=PUSHING) for number in episodes)
@@ -104,7 +104,7 @@ def main() -> None:
     parser.add_argument("--tokenizer", default="fsq-lab")
     parser.add_argument("--device", default="cpu", help="of the tokenizer, as hma convert's")
     parser.add_argument("--frames", choices=("all", "strided"), default="strided", help="as hma convert's")
-    parser.add_argument("--pushing", action="store_true", help="go to blocks twice as often")
+    parser.add_argument("--pushing", action="store_true", help="go to blocks twice as often, and hold keys")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     robots = [*given.robots, *family.further(given.further)]

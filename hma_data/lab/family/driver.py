@@ -1,7 +1,8 @@
 """Drive the family's robots by random manoeuvres of 0.3 to 1.5 s, or straight to a block.
 
 A manoeuvre goes to a pose (to a block, or anywhere), holds a velocity, weaves, or rests. Axes commanded by
-velocity turn back at their limits. A gripper closes round a block in its reach, and opens again later.
+velocity turn back at their limits, unless keys are held down: then they press on there, as in `hma play`. A
+gripper closes round a block in its reach, and opens again later.
 `Reacher` has one aim, the block that lies nearest, and looks at each step: a task that can be learned.
 """
 
@@ -13,9 +14,10 @@ from hma_data.arrays import Floats
 from hma_data.lab.family.bodies import Body
 from hma_data.lab.family.look import SIZE, wrapped
 
-MANOEUVRES = ("block", "anywhere", "hold", "weave", "rest")
-CHANCES = (0.27, 0.26, 0.22, 0.15, 0.1)
-PUSHING = (0.55, 0.17, 0.14, 0.09, 0.05)  # recordings in which blocks move half as often again, or twice
+MANOEUVRES = ("block", "anywhere", "hold", "weave", "rest", "keys")
+CHANCES = (0.27, 0.26, 0.22, 0.15, 0.1, 0.0)
+PUSHING = (0.45, 0.11, 0.11, 0.05, 0.03, 0.25)  # blocks move half as often again, or twice; and held keys
+LONGEST = {"rest": 0.8, "keys": 2.5}  # seconds
 Manoeuvre = Callable[[Floats], Floats]  # pose (Q,) -> velocities (A,)
 GAIN, NUDGE, DAMPING = 2.0, 1e-4, 1.0  # of a reach: 1/s; of a pose, in widths of its limits; px²
 
@@ -34,18 +36,19 @@ class Driver:
         self._setpoint = pose[: len(body.commands)].copy()
         self._left = 0
         self._goal: Floats | None = None
+        self._keys = False
         self._opening = float(pose[-1])
         self._manoeuvre = self._rest()
 
     def __call__(self, pose: Floats, blocks: Floats, holding: bool) -> Floats:
         """Return the next action (A,) at a pose (Q,) among blocks (B, 2)."""
-        lost = self._goal is None and not self._visible(pose)
+        lost = self._goal is None and not self._keys and not self._visible(pose)
         if self._left == 0 or lost:
             kind = "anywhere" if lost else str(self._rng.choice(MANOEUVRES, p=self._chances))
             self._begin(pose, blocks, holding, kind)
         self._left -= 1
         velocity = np.clip(self._manoeuvre(pose) * self._sign, -self._tops, self._tops)
-        if not self._body.car:
+        if not self._body.car and not self._keys:
             self._turn_back(pose, velocity)
         return self._command(velocity)
 
@@ -75,7 +78,8 @@ class Driver:
     def _begin(self, pose: Floats, blocks: Floats, holding: bool, kind: str) -> None:
         """Begin a manoeuvre; choose how long it lasts, and what the gripper does in it."""
         rng, hz = self._rng, self._body.hz
-        self._left = max(1, round(hz * rng.uniform(0.3, 0.8 if kind == "rest" else 1.5)))
+        self._left = max(1, round(hz * rng.uniform(0.3, LONGEST.get(kind, 1.5))))
+        self._keys = kind == "keys"
         self._sign[:] = 1
         self._setpoint = np.where(self._follows, self._setpoint, pose[: len(self._setpoint)])
         self._goal = self._pose_near(blocks, pose) if kind == "block" else None
@@ -84,7 +88,8 @@ class Driver:
         if self._goal is not None:
             self._manoeuvre = self._steer if self._body.car else self._approach(self._goal)
         else:
-            self._manoeuvre = {"hold": self._hold, "weave": self._weave, "rest": self._rest}[kind]()
+            others = {"hold": self._hold, "weave": self._weave, "rest": self._rest, "keys": self._press}
+            self._manoeuvre = others[kind]()
         if self._body.grip:
             tip, _ = self._body.mechanism.tip(pose)
             near = bool((np.linalg.norm(blocks - tip, axis=1) < 8.0).any())
@@ -148,6 +153,10 @@ class Driver:
         strength, hz = self._tops * rng.uniform(0.5, 1.0, count), rng.uniform(0.3, 1.0, count)
         phase, seconds = rng.uniform(0, 2 * np.pi, count), iter(np.arange(10_000) / self._body.hz)
         return lambda pose: strength * np.sin(2 * np.pi * hz * next(seconds) + phase)
+
+    def _press(self) -> Manoeuvre:
+        velocity = self._tops * self._rng.integers(-1, 2, len(self._tops))
+        return lambda pose: velocity
 
     def _rest(self) -> Manoeuvre:
         return lambda pose: np.zeros(len(self._tops))

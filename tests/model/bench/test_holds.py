@@ -8,6 +8,7 @@ import pytest
 
 from hma_data.errors import UsageError
 from hma_data.lab import pusht
+from hma_data.lab.simulator import embodiment
 from hma_model.evaluation.wholeness import Left, left_at, left_words
 from recipes.bench import holds
 from recipes.lab import pushes
@@ -147,3 +148,17 @@ def test_contact_is_of_one_robot_and_as_long_as_its_recording() -> None:
         holds.run(holds.BENCH.defaults | {"driver": "contact", "robots": "arm1_02"})
     with pytest.raises(UsageError, match="has 50 frames an episode, not 51"):
         pushes.contact_episode(51, 2, seed=0, episode=0)
+
+
+@pytest.mark.parametrize("robot", ["mover_04", "pusht_fast"])
+def test_keys_are_held_at_an_end_or_in_the_middle_of_each_action(robot: str) -> None:
+    e = embodiment(robot)
+    held = round(holds.HELD_S * e.rate_hz)
+    actions = holds.held_keys(robot, 10 * held + 1, seed=3, number=1)
+    assert (
+        len(actions) == 10 * held + 1
+        and not np.diff(actions[: 10 * held].reshape(10, held, -1), axis=1).any()
+    )
+    ranges = np.array([part.range for part in e.action.components for _ in range(part.dims)])
+    kinds = (actions - ranges[:, 0]) / np.ptp(ranges, axis=1)
+    assert set(np.unique(kinds)) == {0, 0.5, 1}
