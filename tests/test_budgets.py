@@ -19,7 +19,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/episodes": (1_811, 15_797, 9),
     "hma_data/hub": (517, 3_857, 3),
     "hma_data/inspection": (2_096, 19_891, 8),
-    "hma_data/lab": (3_300, 29_285, 16),
+    "hma_data/lab": (3_300, 29_290, 16),
     "hma_data/loading": (1_278, 10_753, 6),
     "hma_data/registry": (1_268, 8_248, 6),
     "hma_data/shards": (2_494, 19_183, 11),
@@ -44,7 +44,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_670, 30_166, 20),
     "hma_model/worlds": (1_478, 11_069, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_378, 514_802
+PRODUCT_LINES, PRODUCT_NODES = 65_378, 514_807
 TEST_LINES = 48_303
 DOC_WORDS = 41_873
 

@@ -100,9 +100,9 @@ def keys_episode(robot: str, length: int, stride: int, seed: int, number: int) -
 def held_keys(robot: str, count: int, seed: int, number: int) -> Floats:
     """Return actions (count, A) as of a person: each value stays at an end or in the middle for HELD_S."""
     known, rate = embodiment(robot).action.components, embodiment(robot).rate_hz
-    ranges = [part.range or (-1, 1) for part in known for _ in range(part.dims)]
-    drawn = np.random.default_rng((seed, number)).integers(0, 3, (count, len(ranges)))
-    actions = np.array([np.linspace(*one, 3)[at] for one, at in zip(ranges, drawn.T, strict=True)]).T
+    low, high = np.array([part.range or (-1.0, 1.0) for part in known for _ in range(part.dims)], float).T
+    drawn = np.random.default_rng((seed, number)).integers(0, 3, (count, len(low)))
+    actions = low + (high - low) * drawn / 2
     return np.repeat(actions, round(HELD_S * rate), axis=0)[:count]
 
 

@@ -155,7 +155,7 @@ class Driver:
         return lambda pose: strength * np.sin(2 * np.pi * hz * next(seconds) + phase)
 
     def _press(self) -> Manoeuvre:
-        velocity = self._tops * self._rng.integers(-1, 2, len(self._tops))
+        velocity = self._tops * self._rng.integers(-1, 2, len(self._tops)).astype(float)
         return lambda pose: velocity
 
     def _rest(self) -> Manoeuvre:
