@@ -31,7 +31,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/checkpoint": (949, 7_299, 5),
     "hma_model/cli": (1_762, 11_439, 12),
     "hma_model/demo": (476, 4_001, 4),
-    "hma_model/evaluation": (4_524, 35_874, 24),
+    "hma_model/evaluation": (4_526, 35_929, 24),
     "hma_model/export": (1_160, 9_218, 9),
     "hma_model/generation": (1_632, 13_122, 9),
     "hma_model/hub": (1_058, 8_091, 6),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_670, 30_166, 20),
     "hma_model/worlds": (1_478, 11_069, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_378, 514_807
-TEST_LINES = 48_303
+PRODUCT_LINES, PRODUCT_NODES = 65_380, 514_862
+TEST_LINES = 48_313
 DOC_WORDS = 41_873
 
 

@@ -69,16 +69,18 @@ def continued(
 def palettes(found: Found) -> tuple[Floats, Floats]:
     """Return the colours of the robot's own parts and of loose objects, (C, 3) each.
 
-    The colour of a part is the commonest at its place in the true frames.
+    The colour of a part is the median of those at its place in the true frames.
     """
     side, count = found.true.shape[2], found.parts.shape[2]
     places = np.clip((found.parts * side / truth.SIZE).astype(int), 0, side - 1)
     b, t = np.ogrid[: found.true.shape[0], : found.true.shape[1]]
     taken = [found.true[b, t, places[:, :, p, 1], places[:, :, p, 0]].reshape(-1, 3) for p in range(count)]
+    colors = [np.median(pixels, axis=0) for pixels in taken]
+    spreads = [np.median(np.linalg.norm(pixels - color, axis=-1)) for pixels, color in zip(taken, colors)]
     own, loose = list[Floats](), list[Floats]()
-    for part, pixels in enumerate(taken):
-        color, kept = np.median(pixels, axis=0), own if part < found.driven else loose
-        # places of one object differ a little
+    # places of one object differ a little; one at its edge, whose pixels are blends, has the wider spread
+    for part in np.argsort(spreads, kind="stable"):
+        color, kept = colors[part], own if part < found.driven else loose
         if all(np.linalg.norm(color - other) >= NEAR for other in kept):
             kept.append(color)
     return np.reshape(own, (-1, 3)), np.reshape(loose, (-1, 3))

@@ -9,7 +9,7 @@ import pytest
 from hma_data.errors import UsageError
 from hma_data.lab import pusht
 from hma_data.lab.simulator import embodiment
-from hma_model.evaluation.wholeness import Left, left_at, left_words
+from hma_model.evaluation.wholeness import Left, left_at, left_words, palettes
 from recipes.bench import holds
 from recipes.lab import pushes
 
@@ -95,6 +95,16 @@ def test_two_places_of_one_object_are_one_object_though_one_lies_on_its_edge() -
     parts = np.stack([own, corner, foot], axis=1)[None] * 2
     judged = holds._row(holds.Found("toy", shaded, scene(PLACES), parts, driven=1), FRAMES - 1)
     assert (judged["moved"], judged["overlap"], judged["shape"], judged["left"]) == (1, 1, 1, 1)
+
+
+def test_an_objects_color_is_not_that_of_a_place_at_its_edge() -> None:
+    blended = scene(PLACES)
+    for frame, (x, y) in enumerate(PLACES):
+        blended[0, frame, y, x : x + 4] = (205, 40 + 5 * frame, 40 + 5 * frame)
+    edge, inside = np.array(PLACES, float), np.array(PLACES, float) + 2
+    parts = np.stack([np.full_like(edge, 54), edge, inside], axis=1)[None] * 2
+    _, loose = palettes(holds.Found("toy", blended, blended, parts, driven=1))
+    np.testing.assert_array_equal(loose, [RED])
 
 
 def test_what_melted_or_what_nobody_touched_is_told() -> None:
