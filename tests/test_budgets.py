@@ -14,8 +14,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
     "hma_data": (744, 4_321, 8),
-    "hma_data/cli": (1_540, 10_986, 8),
-    "hma_data/conversion": (4_079, 30_119, 15),
+    "hma_data/cli": (1_544, 11_013, 8),
+    "hma_data/conversion": (4_086, 30_183, 15),
     "hma_data/episodes": (1_811, 15_797, 9),
     "hma_data/hub": (517, 3_857, 3),
     "hma_data/inspection": (2_096, 19_891, 8),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_670, 30_166, 20),
     "hma_model/worlds": (1_478, 11_069, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_380, 514_862
-TEST_LINES = 48_313
+PRODUCT_LINES, PRODUCT_NODES = 65_391, 514_953
+TEST_LINES = 48_318
 DOC_WORDS = 41_873
 
 

@@ -218,6 +218,7 @@ def _print_plan(conversion: "Conversion", share: "Share | None", json: bool) -> 
                 "out": str(place(conversion.out)),
                 "episodes": plan.episodes,
                 "left_out": plan.left_out,
+                "frames_in_no_episode": plan.outside,
                 "frames": plan.frames,
                 "bytes": cost.bytes,
                 "frames_per_second": cost.frames_per_second,
@@ -236,7 +237,7 @@ def _print_plan(conversion: "Conversion", share: "Share | None", json: bool) -> 
     _print_cameras(
         cameras_line(plan.facts["cameras"], robot), cost.frame_sizes, robot, opened.spec.image_size
     )
-    _print_left_out(plan.left_out)
+    _print_left_out(plan)
     if cost.seconds is None:
         say(f"time unknown, no episode could be read: {cost.fault}")
     else:
@@ -263,7 +264,7 @@ def _print_dataset_plan(conversion: "Conversion", json: bool) -> None:
     parts = human_count(len(plan.units), "part")
     say(f"{_read(plan, uri)} into a LeRobotDataset v3.0 of {facts['fps']} fps, made in {parts}")
     _print_sizes(facts["sizes"])
-    _print_left_out(plan.left_out)
+    _print_left_out(plan)
 
 
 def _read(plan: "Plan", uri: str) -> str:
@@ -302,7 +303,7 @@ def _report(summary: "Summary", lasting: "list[Finding]", max_quarantine: float,
     else:
         for one in summary.outputs:
             _print_made(one)
-        _print_left_out(summary.left_out)
+        _print_left_out(summary)
         if summary.held_out:
             print(summary.held_out)
         if summary.flags:
@@ -344,6 +345,7 @@ def _facts(summary: "Summary", lasting: "list[Finding]") -> dict[str, Any]:
         "pictures": summary.frame_sizes,
         "flags": summary.flags,
         "left_out": summary.left_out,
+        "frames_in_no_episode": summary.outside,
         "changed": summary.changed,
         "warning": summary.warning,
         "held_out": summary.held_out,
@@ -390,6 +392,8 @@ def _print_cameras(line: str, sizes: dict[str, tuple[int, int]], robot: Any, siz
         print(describe_resize(robot.camera(name), height, width, size))
 
 
-def _print_left_out(count: int) -> None:
-    if count:
-        say(f"left out by only and exclude: {human_count(count, 'episode')}")
+def _print_left_out(found: "Plan | Summary") -> None:
+    if found.left_out:
+        say(f"left out by only and exclude: {human_count(found.left_out, 'episode')}")
+    if found.outside:
+        say(f"in no episode: {human_count(found.outside, 'recorded frame')}")

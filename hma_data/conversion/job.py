@@ -153,7 +153,10 @@ class Conversion(Options):
         if self.to == "lerobot":
             plan = with_dataset(plan, uri, robot)
         own_split = any(chosen.column("split").unique().to_pylist())
-        return replace(plan, left_out=len(refs) - len(chosen), own_split=own_split), uri
+        # the episodes of one recording all state what is outside of them
+        outside = chosen.table.group_by("group").aggregate([("left_out", "max")]).column("left_out_max")
+        counts = {"left_out": len(refs) - len(chosen), "outside": pc.sum(outside).as_py() or 0}
+        return replace(plan, **counts, own_split=own_split), uri
 
     def run(self, on_progress: OnProgress = lambda progress: None) -> Summary:
         """Make the shard set; running it again continues.
@@ -388,6 +391,7 @@ class _Run:
             too_many=manifest.quarantined > most,
             frame_sizes=self.frame_sizes,
             left_out=self.whole.left_out,
+            outside=self.whole.outside,
             changed=done.news,
             warning=warning,
             notes=tuple(notes),

@@ -77,12 +77,14 @@ class Plan:
 
     Attributes:
         left_out: number of the recording's episodes that `only` and `exclude` leave out.
+        outside: number of frames of the recordings that are in none of their episodes.
         own_split: whether the recording states which episodes are for validation.
     """
 
     units: tuple[ShardUnit, ...]
     facts: dict[str, Any]
     left_out: int = 0
+    outside: int = 0
     own_split: bool = False
 
     @classmethod

@@ -45,7 +45,7 @@ class Summary:
         reasons: message (without the ids where there are several) -> number of episodes refused for it.
         flags: name -> count over all episodes, such as masked_actions; see docs/format.md.
         frame_sizes: camera -> (height, width) of its recorded frames; empty if no shard was made.
-        left_out: number of the recording's episodes that `only` and `exclude` leave out.
+        left_out, outside: those of the plan.
         too_many: True where more than `max_quarantine` was refused; the command ends with exit code 1.
         changed: what the YAML says now that a finished set did not say yet; empty if nothing.
         warning: the fault of a rate that the recordings do not have; empty if there is none.
@@ -65,6 +65,7 @@ class Summary:
     too_many: bool
     frame_sizes: dict[str, tuple[int, int]] = field(default_factory=dict)
     left_out: int = 0
+    outside: int = 0
     changed: str = ""
     warning: str = ""
     notes: tuple[str, ...] = ()

@@ -10,6 +10,7 @@ from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.bags import segments
+from tests.command import hma
 from tests.data.bag_files import SOURCE, START_NS
 from tests.data.bag_parts import KINDS, STATE, TASK, Said, make_run, parted, ros1
 
@@ -74,6 +75,10 @@ def test_start_and_stop_are_the_moments_at_which_a_value_becomes_theirs(tmp_path
         19,
     ]  # pictures received between 1.01 and 2.41 s, and from 4.01 s
     assert {ref.left_out for ref in refs} == {27}
+    (tmp_path / "arm.yaml").write_text(parted(RECORDING).to_yaml())
+    words = ["convert", "-e", tmp_path / "arm.yaml", "--source", path, "--tokenizer", "fsq-8", "--dry-run"]
+    planned = hma(*words, "--out", tmp_path / "out")
+    assert "in no episode: 27 recorded frames" in planned.stdout
 
 
 @pytest.mark.parametrize(
