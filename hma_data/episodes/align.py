@@ -348,7 +348,7 @@ def pause_remedy(embodiment: Embodiment, hz: float | None) -> str:
     """Return what can be done about the pauses in a grid of `hz`; empty unless it is a bag's."""
     if embodiment.source.format != "rosbag" or not hz:
         return ""
-    stride = embodiment.stride if embodiment.rate_hz else 1
+    stride = embodiment.stride if embodiment.states_rate else embodiment.stride_override or 1
     return divide_remedy((max(PAUSE, stride) - 0.5) / hz)
 
 

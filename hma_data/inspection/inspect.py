@@ -388,14 +388,17 @@ def _times(clips: list[Clip], robot: Embodiment) -> Iterator[Finding]:
     if hz and (steps > 3 / hz).any():
         said = f"frames pause for up to {steps.max():.3g} s; no window crosses pauses of a model step or more"
         yield Finding("gaps", "warn", said, pause_remedy(robot, hz))
-    needed = WINDOW * robot.stride  # the chunk of the last frame too
     lengths = sorted(len(clip) for clip in clips)
+    known = robot.states_rate or robot.stride_override  # else no stride, and so no window
+    needed = WINDOW * robot.stride if known else 0  # the chunk of the last frame too
     short = sum(length < needed for length in lengths)
     if short:
         said = f"{short} of {len(clips)} episodes are shorter than a window, {needed} frames"
         fits = max(lengths[len(lengths) // 10] // WINDOW, 1)  # nine of ten episodes hold a window
-        remedy = f"set a higher target_hz, such as {robot.rate_hz / fits:.3g}, or fewer frames per window"
-        yield Finding("length", "warn", said, remedy)
+        remedy = "set a smaller stride"
+        if not robot.stride_override:
+            remedy = f"set a higher target_hz, such as {robot.rate_hz / fits:.3g}"
+        yield Finding("length", "warn", said, f"{remedy}, or fewer frames per window")
     for stream in dict.fromkeys(name for clip in clips for name in clip.skew_ms):
         moved = [clip.skew_ms[stream] for clip in clips if stream in clip.skew_ms]
         late = float(np.percentile(np.concatenate(moved), 95))

@@ -13,7 +13,7 @@ import pytest
 from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError
 from hma_data.inspection.infer import infer
-from hma_data.inspection.inspect import examine
+from hma_data.inspection.inspect import examine, inspect_recording
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.bags.clocks import SECOND_NS, MessageTimes, sorted_by
 from hma_data.storage.yaml_io import parse_yaml
@@ -62,6 +62,20 @@ def pairs(path: Path, embodiment: Embodiment, episode: str = "") -> list[tuple[i
     name = episode or SOURCE.episode_ids(str(path))[0]
     clip = to_clip(SOURCE.read(str(path), name, embodiment), embodiment)
     return list(zip(ros2.numbers(clip), clip.actions[:, 0].astype(int).tolist(), strict=True))
+
+
+@pytest.mark.parametrize("rate", ["frequency_hz: unknown", "frequency_hz: null\nstride: 4"])
+def test_a_bag_whose_rate_nobody_states_is_inspected_by_its_times(rate: str, tmp_path: Path) -> None:
+    def paused(i: int) -> int:
+        return at(i) + (i >= 20) * 5 * SECOND_NS
+
+    path, yaml = bag(tmp_path / "run", paused, paused), tmp_path / "toy.yaml"
+    text = YAML.format(sync="", stamp="", action="/cmd.data")
+    yaml.write_text(text.replace("frequency_hz: 10", rate))
+    assert inspect_recording(path, yaml)["embodiment"]["rate on the grid"] == "10 Hz"
+    said = " ".join(map(str, examine(path, yaml)))
+    assert "/cam: pauses for 5.1 s" in said
+    assert ("a window, 48 frames — set a smaller stride" in said) == ("stride" in rate)
 
 
 IN_ORDER = [(i, i) for i in range(FRAMES)]
