@@ -33,7 +33,9 @@ from hma_data.inspection.infer_choices import (
     likely,
     shown,
     states,
+    strength,
     vectors,
+    words,
 )
 from hma_data.registry.catalog import entries
 from hma_data.registry.components import Camera, Space
@@ -367,8 +369,13 @@ class _Draft:
             said["stride" if self._short_at_any_rate() else "target_hz"] = (
                 f"so that a model sees {FRAMES_PER_EPISODE} frames of an episode of {length}, if it has them"
             )
-        if self.action.question:
-            said["action"] = f"{TODO}: {self.action.question}"
+        unread = [  # perhaps it is the action
+            f"{one.message}; {one.remedy}"
+            for one in self.found.findings
+            if one.check == "readable" and strength(words(one.key))
+        ]
+        if asked := [one for one in (self.action.question, *unread) if one]:
+            said["action"] = f"{TODO}: {' '.join(asked)}"
         if padded := [one.message for one in self.found.findings if one.check == "padding"]:
             said["last_step"] = "; ".join(padded)
         if self.seen.question or self.looks:

@@ -1,7 +1,9 @@
 """Which numbers of a message become an action: by name wherever names stand, and those that move."""
 
 import math
+import re
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -127,8 +129,8 @@ def test_a_field_of_a_list_is_read_from_each_and_may_be_sliced(tmp_path: Path) -
     np.testing.assert_allclose(episode.actions[0].values, expected, atol=1e-5)
 
 
-def mcap_of_two_types(path: Path) -> Path:
-    """JointState with i, and an array with 500 + i a millisecond later, both on /cmd."""
+def mcap_of_two_types(path: Path, measured: Sequence[str] = ()) -> Path:
+    """JointState with i, and an array with 500 + i a millisecond later, both on /cmd; `measured` has i."""
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start("ros2")
@@ -136,7 +138,7 @@ def mcap_of_two_types(path: Path) -> Path:
         for i in range(FRAMES):
             for topic, message, late in (
                 ("/cam", ros2.image(at(i), i), 0),
-                ("/cmd", ros2.joints(at(i), ["a"], [i]), 0),
+                *((topic, ros2.joints(at(i), ["a"], [i]), 0) for topic in ("/cmd", *measured)),
                 ("/cmd", ros2.array([500 + i]), 10**6),
             ):
                 kind = message.__msgtype__
@@ -153,11 +155,13 @@ def mcap_of_two_types(path: Path) -> Path:
 def test_a_topic_of_two_types_is_refused(tmp_path: Path) -> None:
     path = mcap_of_two_types(tmp_path / "run.mcap")
     said = "/cmd carries sensor_msgs/msg/JointState and std_msgs/msg/Float64MultiArray"
-    with pytest.raises(EpisodeError, match=f"{said} — filter the recording to one of them"):
+    with pytest.raises(EpisodeError, match=f"run.mcap: {said} — filter the recording to one of them"):
         pairs(path, robot(action="/cmd.position"))
     assert any(said in problem for problem in SOURCE.inspect(str(path)).problems)
     with pytest.raises(SourceError, match=f"nothing that could be an action.*{said} — filter the recording"):
         infer(str(path), "x")
+    text = infer(str(mcap_of_two_types(path, ["/joint_states"])), "x")
+    assert re.search(f"may /joint_states.position, as measured, be the action.*{said}", text)
 
 
 @pytest.mark.parametrize("unit", [1, 10**3, 10**6, 10**9])
