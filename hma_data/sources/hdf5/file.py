@@ -36,6 +36,7 @@ HELD_BYTES = 512 << 20  # of decompressed chunks in memory, over all datasets of
 HELD_DATASETS = 64  # of images that stay open; without chunks they take no bytes of the above
 MAX_BYTES = 1 << 30  # of a chunk
 MAX_NUMBERS = 1 << 26  # values read whole; they become float64
+MAX_SINGLE = 1 << 16  # bytes of a single value, such as a text
 MAX_ROW = 1 << 28  # values of a row: more than any image has
 MAX_DEPTH = 4  # of the groups above the episodes
 MAX_GROUPS_SAMPLED = 8  # most groups looked into to see whether they and their like are episodes
@@ -428,8 +429,10 @@ def is_elsewhere(found: h5py.Dataset, group: h5py.Group) -> bool:
 
 
 def is_single(found: Any, group: h5py.Group) -> TypeGuard[h5py.Dataset]:
-    """Check whether something is a dataset of one value that lies in the same file as a group."""
-    return isinstance(found, h5py.Dataset) and found.size == 1 and not is_elsewhere(found, group)
+    """Check whether something is a dataset of one short value that lies in the same file as a group."""
+    if not isinstance(found, h5py.Dataset) or found.size != 1 or is_elsewhere(found, group):
+        return False
+    return bool(found.dtype.itemsize <= MAX_SINGLE)  # a small file may state gigabytes
 
 
 def is_plausible(found: h5py.Dataset) -> bool:

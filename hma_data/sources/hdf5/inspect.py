@@ -255,7 +255,7 @@ def _hertz(value: Any) -> float | None:
     """Return the rate that a number or a text such as `20 Hz` states; None where it states none."""
     if isinstance(value, np.ndarray | np.generic) and value.size == 1:
         value = value.item()
-    words = re.fullmatch(r"(\d+\.?\d*) ?(hz|fps)?", text(value).lower())
+    words = re.fullmatch(r"(\d+(?:\.\d*)?) ?(hz|fps)?", text(value).lower())
     number = float(words[1]) if words else value
     is_number = isinstance(number, int | float) and not isinstance(number, bool)
     return float(number) if is_number and 0 < number < MAX_HZ else None

@@ -381,6 +381,7 @@ def test_colours_of_other_numbers_than_bytes_are_cameras_with_their_range(
         ({"fps": 12}, None, 12),
         ({"fps": "fast"}, None, None),
         ({"fps": "12.5 Hz"}, None, 12.5),
+        ({"fps": "1" * 60_000 + "x"}, None, None),  # a pattern that tries every split takes an hour
         ({"hz": np.array([b"15"])}, None, 15),
         ({"control_freq": "0", "rate": "-3", "frequency": "1e3"}, None, None),
         ({}, np.arange(T) * 50_000_000 + 1_700_000_000_000_000_000, 20),

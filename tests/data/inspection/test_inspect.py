@@ -19,6 +19,7 @@ from hma_data.sources.common import checks
 from hma_data.sources.common.checks import CameraLook, choose, measure, ycbcr_share
 from hma_data.sources.common.survey import CHECKS
 from tests.data.bag_files import make_recording, write_ros1, write_ros2
+from tests.data.hdf5_files import embodiment
 from tests.data.rlds_files import TEXT, image, png, tensor, write
 from tests.data.videos import encode as encode_video
 from tests.data.videos import make_v2
@@ -154,6 +155,20 @@ def test_pictures_that_claim_more_than_any_have_are_not_read(tmp_path: Path, sha
 
     tracemalloc.start()
     damaged(tmp_path, bomb)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 100 << 20
+
+
+@pytest.mark.parametrize("name", ["fps", "instruction"])
+def test_a_single_value_that_states_many_bytes_is_not_read(tmp_path: Path, name: str) -> None:
+    def bomb(file: h5py.File) -> None:
+        file.create_dataset(name, (1,), f"S{1 << 28}")
+
+    tracemalloc.start()
+    damaged(tmp_path, bomb)
+    robot = embodiment(cameras=[{"name": "front", "key": "obs/image"}])
+    open_source("hdf5").read(str(tmp_path / "demo.hdf5"), "demo_0", robot)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 100 << 20
