@@ -226,11 +226,11 @@ def _pixels(message: Any, where: str, pixel: int) -> Images:
     data = child(message, "data")
     flat = data if isinstance(data, np.ndarray) else np.frombuffer(payload(message), np.uint8)
     shared = planar or (pixel == 2 and stated != MONO16)  # two pixels of YUV share their colour
-    uneven = (shared and width % 2) or (planar and height % 2)
-    if uneven or step < row or len(flat) < step * (rows - 1) + row:
-        raise EpisodeError(
-            where, f"an image of {width}×{height} in {stated} has {len(flat):,} bytes, rows of {step}"
-        )
+    fault = f"an image of {width}×{height} in {stated}"
+    if (shared and width % 2) or (planar and height % 2):
+        raise EpisodeError(where, f"{fault} does not have even sides")
+    if step < row or len(flat) < step * (rows - 1) + row:
+        raise EpisodeError(where, f"{fault} has {len(flat):,} bytes, rows of {step}")
     if len(flat) < step * rows:  # the last row may end with its last pixel
         flat = np.concatenate([flat, np.zeros(step * rows - len(flat), np.uint8)])
     pixels = np.ascontiguousarray(flat[: step * rows].reshape(rows, step)[:, :row])

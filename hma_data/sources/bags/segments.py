@@ -124,7 +124,7 @@ def part(bag: Bag, embodiment: Embodiment, segments: Segments) -> SegmentTable:
     videos = {
         c.topic for c in bag.counts() if c.topic in cameras and image_kind(c.type) in (STILL_IMAGE, VIDEO)
     }
-    tracks = {key: TopicTrack(key) for key in {camera.key} | videos}
+    tracks = {key: TopicTrack(key, where) for key in {camera.key} | videos}
     start = MarkerTrack(segments.start, topics, where) if segments.start else None
     stop = MarkerTrack(segments.stop, topics, where) if segments.stop else None
     markers = [marker for marker in (start, stop) if marker]
@@ -233,7 +233,7 @@ class MarkerTrack:
     def __init__(self, marker: Marker, topics: Iterable[str], where: str) -> None:
         self.marker, self._where = marker, where
         self._field = parse_key(marker.key, topics, where)
-        self.track = TopicTrack(self._field.topic)
+        self.track = TopicTrack(self._field.topic, where)
         self._fitting: list[bool] = []  # of each message
         self._seen: dict[str, None] = {}
 

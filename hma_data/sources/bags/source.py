@@ -224,7 +224,7 @@ class _EpisodeReading:
     # -- the pass
 
     def _track(self, topic: str) -> TopicTrack:
-        return self._tracks.setdefault(topic, TopicTrack(topic))
+        return self._tracks.setdefault(topic, TopicTrack(topic, self._where))
 
     def _columns(self, components: tuple[Component, ...]) -> list[Column]:
         columns = []

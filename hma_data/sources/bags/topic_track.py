@@ -264,10 +264,13 @@ class TopicTrack:
         kind: raw, still or video, by the content of the messages; None without images.
         codec: of video; empty for anything else.
         b_slices: whether some frames of H.264 are stored after frames that are shown later.
+
+    Args:
+        where: the bag, for errors.
     """
 
-    def __init__(self, topic: str) -> None:
-        self.topic = topic
+    def __init__(self, topic: str, where: str = "the bag") -> None:
+        self.topic, self._where = topic, where
         self.columns: list[Column] = []
         self.channels: list[Channel] = []
         self.kind: str | None = None
@@ -288,7 +291,7 @@ class TopicTrack:
         if channel not in self.channels:
             if message is not None and self.channels and channel.type != self.channels[0].type:
                 fault = f"{self.topic} carries {self.channels[0].type} and {channel.type}"
-                raise EpisodeError("the bag", fault, "filter the recording to one of them")
+                raise EpisodeError(self._where, fault, "filter the recording to one of them")
             self.kind = content_kind(message, image_kind(channel.type))
             self.channels.append(channel)
         for column in self.columns:
@@ -303,13 +306,14 @@ class TopicTrack:
         try:
             self.codec = self.codec or video_codec(message)
             if self.codec not in CODECS:
-                fault, remedy = f"video in {self.codec!r} cannot be read", f"these can: {', '.join(CODECS)}"
-                raise EpisodeError(self.topic, fault, remedy)
+                fault = f"{self.topic}: video in {self.codec!r} cannot be read"
+                raise EpisodeError(self._where, fault, f"these can: {', '.join(CODECS)}")
             data = payload(message)
             self.b_slices = self.b_slices or (self.codec == "h264" and has_b_slices(data))
             return is_keyframe(data, self.codec)
         except (KeyError, TypeError, ValueError) as fault:
-            raise EpisodeError(self.topic, f"a message is not a frame of a video: {fault!r}") from fault
+            said = f"{self.topic}: a message is not a frame of a video: {fault!r}"
+            raise EpisodeError(self._where, said) from fault
 
     @property
     def times(self) -> MessageTimes:

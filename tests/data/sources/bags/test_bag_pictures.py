@@ -216,8 +216,10 @@ def test_video_begins_at_its_first_key_frame(tmp_path: Path) -> None:
 
 def test_unknown_video_is_refused(tmp_path: Path) -> None:
     write_video(tmp_path / "v.mcap", "libvpx-vp9", "mjpeg2000", {"deadline": "realtime"})
-    with pytest.raises(EpisodeError, match=r"'mjpeg2000' cannot be read.*h264"):
+    said = r"/video: video in 'mjpeg2000' cannot be read"
+    with pytest.raises(EpisodeError, match=rf"v\.mcap: {said}.*h264"):
         read(tmp_path / "v.mcap", arm(VIDEO_YAML))
+    assert any(said in problem for problem in SOURCE.inspect(str(tmp_path / "v.mcap")).problems)
 
 
 @pytest.mark.parametrize("padding", [0, 4])
@@ -232,6 +234,8 @@ def test_semi_planar_yuv_is_converted_plane_by_plane(encoding: str, padding: int
     np.testing.assert_allclose(found, np.broadcast_to([254, 0, 0], (4, 6, 3)), atol=2)
     with pytest.raises(EpisodeError, match="has 20 bytes"):
         picture(image(encoding, np.zeros(20, np.uint8), 4, 4, 4), "raw", "")
+    with pytest.raises(EpisodeError, match="6×3 in nv.. does not have even sides"):
+        picture(image(encoding, np.zeros(64, np.uint8), 6, 3, 6), "raw", "")
 
 
 def test_opencvs_names_of_encodings_are_blue_first() -> None:
