@@ -155,8 +155,8 @@ class Conversion(Options):
         own_split = any(chosen.column("split").unique().to_pylist())
         # the episodes of one recording all state what is outside of them
         outside = chosen.table.group_by("group").aggregate([("left_out", "max")]).column("left_out_max")
-        counts = {"left_out": len(refs) - len(chosen), "outside": pc.sum(outside).as_py() or 0}
-        return replace(plan, **counts, own_split=own_split), uri
+        plan = replace(plan, left_out=len(refs) - len(chosen), own_split=own_split)
+        return replace(plan, outside=pc.sum(outside).as_py() or 0), uri
 
     def run(self, on_progress: OnProgress = lambda progress: None) -> Summary:
         """Make the shard set; running it again continues.
