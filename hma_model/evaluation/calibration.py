@@ -241,9 +241,12 @@ def _by_bin(stated: Floats, values: Floats, seed: int = 0) -> tuple[Floats, Floa
 
 
 def _means_of(sums: Floats, counts: Ints, seed: int) -> tuple[Floats, Floats]:
-    """Return the means (…) of values with sums and counts (N, …) by scene, and those of resamples (R, …)."""
-    drawn = resampled_means(sums, seed) / np.maximum(resampled_means(counts, seed), 1e-12)
-    return sums.sum(axis=0) / counts.sum(axis=0), drawn
+    """Return the means (…) of values with sums and counts (N, …) by scene, and those of resamples (R, …).
+
+    The ratio is linearised: a resample may hold hardly any value of a bin, and nothing divides by its count.
+    """
+    means = sums.sum(axis=0) / counts.sum(axis=0)
+    return means, means + resampled_means(sums - means * counts, seed) / counts.mean(axis=0)
 
 
 def _reliability(
@@ -256,8 +259,9 @@ def _reliability(
     curve[f"measured_{name}_95"] = rounded(np.percentile(drawn, LEVELS, axis=0).clip(*NATURAL).T)
     gaps = np.abs(drawn - told_drawn).mean(axis=1)
     gap = float(np.abs(means - told).mean())
-    low, high = np.percentile(gaps, LEVELS)  # noise can only add to a gap
-    ends = np.array([min(low, gap), max(high, gap)])
+    low, high = np.percentile(gaps, LEVELS)
+    # Noise adds to a gap, in the figure and once more in the resamples: the true one is as far below.
+    ends = np.array([max(min(low, 2 * gap - high), 0.0), max(high, gap)])
     return {f"gap_{name}": rounded(gap), f"gap_{name}_95": rounded(ends)}
 
 

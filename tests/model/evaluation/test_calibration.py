@@ -113,6 +113,17 @@ def test_reliability_and_risk_are_what_plain_loops_compute() -> None:
     assert found["half_gain_px"] == pytest.approx(risk["episodes_px"][0] - risk["episodes_px"][5], abs=2e-4)
 
 
+def test_intervals_of_bins_stay_within_the_errors_and_that_of_the_gap_holds_the_true_one() -> None:
+    """Each scene has its own level of uncertainty, so a bin is of few scenes; the errors follow it."""
+    rng = np.random.default_rng(2)
+    uncertainty = np.exp(rng.normal(0, 1, (16, 1, 1)) + rng.normal(0, 0.1, (16, 5, 12)))
+    stated = accumulated(uncertainty)
+    errors = stated * rng.gamma(4, 1 / 4, (16, 1, 1)) * rng.gamma(4, 1 / 4, stated.shape)
+    found = calibration(uncertainty, errors, errors, **WAY)
+    assert np.max(found["reliability"]["measured_px_95"]) < errors.max()
+    assert found["gap_px_95"][0] == 0 < found["gap_px"] < found["gap_px_95"][1] < errors.max()
+
+
 PAIRS = st.integers(1, 60).flatmap(
     lambda count: st.tuples(*(arrays(np.float64, count, elements=st.floats(0, 9)) for _ in range(2)))
 )
