@@ -78,6 +78,16 @@ class Meter:
         """Return the state error in px to expect at stated uncertainties (…); beyond the last, it is more."""
         return np.interp(stated, self.stated, self.error_px)
 
+    @property
+    def reach(self) -> float:
+        """Return the stated uncertainty up to which frames were measured, as far as the means tell."""
+        before = self.stated[-2:][0]
+        return 2 * self.stated[-1] - before
+
+    def expects_at_most(self, stated: Floats, px: float) -> Bools:
+        """Return whether the error to expect at stated values (…) is at most `px`; not beyond `reach`."""
+        return (self.expected(stated) <= px) & (stated <= self.reach)
+
     def warns(self, stated: Floats) -> Bools:
         """Return whether stated uncertainties (…) are worth a warning."""
         return np.asarray(stated) >= self.limit

@@ -114,7 +114,7 @@ class Abstention:
     @classmethod
     def of(cls, meter: Meter, max_error_px: float, scored: Sequence[Scored]) -> "Abstention":
         """Return what is left of policies' episodes."""
-        kept = meter.expected(np.stack([one.stated for one in scored])) <= max_error_px
+        kept = meter.expects_at_most(np.stack([one.stated for one in scored]), max_error_px)
         success = np.stack([one.success for one in scored], axis=1)
         outcomes = success[REPLAYED], success[MODEL]
         agreed = accuracy(*outcomes, kept) if kept.any() else None

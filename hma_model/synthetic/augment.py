@@ -443,11 +443,13 @@ def _chosen(
     chosen = np.full(len(unsure), not measured)
     chosen[np.argsort(unsure, kind="stable")[: max(1, round(settings.keep * len(unsure)))]] = True
     if meter is not None and settings.max_error is not None:
-        expected = meter.expected(unsure)
-        chosen &= expected <= settings.max_error
+        chosen &= meter.expects_at_most(unsure, settings.max_error)
         if not chosen.any():
-            fault = f"leaves no episode: the smallest expected error at the end is {expected.min():.1f} px"
-            raise HMAError("--max-error", fault, "give more px, or fewer --frames")
+            least = meter.expected(unsure.min())
+            why = f"the smallest expected error at the end is {least:.1f} px"
+            if unsure.min() > meter.reach:
+                why = "all end more uncertain than the rollouts that were calibrated"
+            raise HMAError("--max-error", f"leaves no episode: {why}", "give more px, or fewer --frames")
     if not (chosen & success).any():
         fault = f"none of the {chosen.sum()} least uncertain of {len(unsure)} episodes is judged a success"
         raise HMAError("augment", fault, "make more episodes, keep more, or leave out the judge")

@@ -227,6 +227,10 @@ def test_a_model_abstains_where_it_expects_a_large_error_of_its_own(judge, monke
     assert found.abstention.precision.value == found.abstention.recall.value == 1
     assert "36 of 72 episodes end with an expected state error of at most 6.5 px" in str(sentences(found))
     assert found.to_json()["outcomes"]["p0"]["stated_uncertainty"][4] == 1
+    uncalibrated = replace(METER, stated=(0.0, 1.5))  # which says nothing beyond 3, where an error may be any
+    monkeypatch.setattr(sys.modules[__name__], "METER", uncalibrated)
+    beyond = evaluation(judge, policies, max_error=99.0).abstention
+    assert beyond is not None and beyond.judged == 3 * sum(number / 4 <= 3 for number in range(24)) == 39
     none = evaluation(judge, policies, max_error=0.5)
     assert "nothing is judged" in str(sentences(none))
     assert evaluation(judge, policies).abstention is None

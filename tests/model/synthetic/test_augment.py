@@ -160,6 +160,10 @@ def test_the_surest_episodes_are_kept(kind, request, tmp_path, monkeypatch) -> N
     assert sum(split["episodes"] for split in found.splits.values()) == 2
     with pytest.raises(HMAError, match="--max-error: leaves no episode: the smallest expected error"):
         augment(tmp_path / "none", asked(max_error=0.0), world=world)
+    short = replace(meter, stated=(0.0, 1e-6), error_px=(0.0, 1.0))
+    monkeypatch.setattr(World, "meter", lambda self, robot: (short, ""))
+    with pytest.raises(HMAError, match="all end more uncertain than the rollouts that were calibrated"):
+        augment(tmp_path / "beyond", asked(max_error=99.0), world=world)
 
 
 def test_a_choice_by_uncertainty_that_nobody_has_calibrated_is_warned_of_or_refused(world, tmp_path) -> None:
