@@ -25,6 +25,7 @@ RESAMPLES, BATCHES = 2000, 20  # a batch of ranks of single episodes fits in mem
 MIN_POLICIES, MIN_EPISODES = 3, 8  # fewer say nothing about a correlation
 FEW_POLICIES = 5  # fewer are drawn as the same few again and again: the interval would say nothing
 TAIL = 0.025  # chance beyond either end of an interval
+NEEDED = 4  # scenes with successes, and with failures, in which a judge that is always right passes
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from hma_data.arrays import Bools, Floats, Images
 from hma_data.errors import HMAError, MissingDependencyError, UsageError
 from hma_data.lab import imported
 from hma_data.shards.reader import ShardSet
-from hma_model.evaluation.agreement import Accuracy, accuracy, by_scene, independent, share_interval
+from hma_model.evaluation.agreement import NEEDED, Accuracy, accuracy, by_scene, independent, share_interval
 from hma_model.evaluation.state_reader import Tell
 from hma_model.generation.decode import cameras_for, trained_shards
 from hma_model.policies.lerobot import CONFIG, TASK, hub_repository, network_images
@@ -35,7 +35,6 @@ from hma_model.worlds.world import World
 
 LIMIT = 0.5  # least reward of a success, as lerobot's
 FRAMES_AT_ONCE = 64
-NEEDED = 4  # held-out successes, and failures, with which a judge that is always right passes
 SHARDS = "--from SHARDS (lerobot-eval: --env.judge_from)"
 WEIGHTS = "model.safetensors"
 PREPROCESSOR = "*preprocessor.json"

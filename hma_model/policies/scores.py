@@ -36,6 +36,7 @@ from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.arrays import evenly
 from hma_model.evaluation.agreement import (
+    NEEDED,
     Accuracy,
     Estimate,
     accuracy,
@@ -166,7 +167,8 @@ class PolicyEvaluation:
         """
         judged = self.generated
         if few := judged.too_few:
-            return f"there are too few scenes with {few} to tell whether the judge is better than chance"
+            said = f"there are too few scenes with {few} to tell whether the judge is better than chance"
+            return f"{said} (about {NEEDED} with successes and {NEEDED} with failures are needed)"
         if not judged.better_than_chance:
             if judged.high is not None and judged.high >= GOOD_ACCURACY:
                 return "the judge may be no better than chance; more episodes would tell"

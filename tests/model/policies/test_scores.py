@@ -205,6 +205,7 @@ def test_many_policies_in_one_scene_are_no_verdict(judge: StateJudge) -> None:
     made = [scored_as(f"p{n}", np.array([2.0 + n]), np.array([2.0 + n]), 7.0) for n in range(10)]
     found = evaluation(judge, made, episodes=1)
     assert not found.generated.better_than_chance and "too few scenes with successes" in found.refusal
+    assert found.refusal.endswith("(about 4 with successes and 4 with failures are needed)")
 
 
 def test_episodes_that_begin_alike_count_once() -> None:
