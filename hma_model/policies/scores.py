@@ -5,10 +5,10 @@
 
 Every policy acts in the same scenes of a laboratory robot: once in its simulator, which knows the outcome,
 and once in the world model from the same frames, where a judge reads the outcome off the images. Both
-branches are paired: they share the start, the state in it and all random numbers of every control step, and
-an error says which policy acts otherwise in the first chunk all the same. The
-actions that it gave in the model are also played to the simulator. So the judge's word on generated frames
-is compared with what truly comes of the same actions.
+branches are paired: they share the start, the state in it and all random numbers of every control step. A
+policy is refused if it acts otherwise in the first chunk all the same, and a function also if it does when it
+is shown the simulator's images again. The actions that a policy gave in the model are also played to the
+simulator. So the judge's word on generated frames is compared with what truly comes of the same actions.
 
 With an output folder, what came of each policy lies in a folder of it until the page is written, so the same
 call continues. A policy that was changed in between is scored again.
@@ -62,6 +62,7 @@ from hma_model.policies.fingerprints import (
     world_facts,
 )
 from hma_model.policies.judge import StateJudge, task_of, train_judge
+from hma_model.policies.scripted import Called
 from hma_model.worlds.world import World, load_world
 
 Progress = Callable[[float, str], None]
@@ -431,17 +432,22 @@ def score_policy(
     """Return what comes of one policy in the simulator and in the model: the arrays of `Scored`.
 
     Raises:
-        HMAError: the policy fails, or its first chunks differ though both branches begin alike.
+        HMAError: the policy fails, or acts otherwise though it is given the same again.
     """
     size = world.image_shape[0]
     limit = judge.task.limit
     shown = evenly(frames + 1, SHOWN_FRAMES)
     true = TrueArena(scenes, size)
     true_images, acted = run(name, policy, true, frames, lambda done: tell(0, "in the simulator"))
+    if isinstance(policy, Called):  # others draw from seeded generators alone
+        shown_again: Any = _Shown(scenes, true_images)
+        _, repeated = run(name, policy, shown_again, frames)
+        _require_equal(name, acted, repeated, "shown the same images again, its actions differ")
     model = ModelArena(world, true, judge.probe)
     with closing(model), world.drawing(measure=True):
         model_images, actions = run(name, policy, model, frames, lambda done: tell(done, "in the model"))
-    _require_paired(name, acted[: scenes.stride], actions[: scenes.stride])
+    fault = "from the same image, its first actions differ between model and simulator"
+    _require_equal(name, acted[: scenes.stride], actions[: scenes.stride], fault)
     again = TrueArena(scenes, size, drawn=False)
     for action in actions:
         again.step(action)
@@ -457,17 +463,34 @@ def score_policy(
     }
 
 
-def _require_paired(name: str, true: list[Float32s], model: list[Float32s]) -> None:
-    """Check that the first chunks of a policy in both branches are equal, but for rounding."""
-    scale = np.abs(true).max(axis=(0, 1)) + 1e-6
-    if not (np.abs(np.subtract(true, model)) <= 1e-5 * scale).all():
-        fault = (
-            "is not deterministic: from the same image, its first actions differ between model and simulator"
-        )
+@dataclass
+class _Shown:
+    """An arena that shows images (T + 1 of (N, S, S, 3)) once more, whatever the actions are."""
+
+    scenes: Scenes
+    shown: list[Images]
+    steps: int = 0
+
+    @property
+    def images(self) -> Images:
+        return self.shown[self.steps // self.scenes.stride]
+
+    @property
+    def fresh(self) -> bool:
+        return self.steps % self.scenes.stride == 0
+
+    def step(self, actions: Float32s) -> None:
+        self.steps += 1
+
+
+def _require_equal(name: str, one: list[Float32s], other: list[Float32s], fault: str) -> None:
+    """Check that two series of a policy's actions (N, A) are equal, but for rounding."""
+    scale = np.abs(one).max(axis=(0, 1)) + 1e-6
+    if not (np.abs(np.subtract(one, other)) <= 1e-5 * scale).all():
         remedy = (
             "draw from random, numpy.random or torch, which are seeded, or seed your generator in reset()"
         )
-        raise HMAError(f"policy {name}", fault, remedy)
+        raise HMAError(f"policy {name}", f"is not deterministic: {fault}", remedy)
 
 
 def run(

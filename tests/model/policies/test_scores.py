@@ -341,11 +341,28 @@ def test_branches_share_start_state_and_the_random_numbers_of_every_step(world, 
     model.close()
 
 
-@pytest.mark.parametrize("broken", ["image", "seed", "state", "policy"])
+class LateUnseeded:
+    """It draws from a generator of its own after its first chunk."""
+
+    def __init__(self) -> None:
+        self.calls, self.rng = 0, np.random.default_rng()
+
+    def __call__(self, image: np.ndarray) -> np.ndarray:
+        self.calls += 1
+        return np.array([0.0, self.rng.normal() if self.calls > 9 else 0.0])
+
+
+@pytest.mark.parametrize("name", ["unseeded", "LateUnseeded"])
+def test_a_function_that_acts_otherwise_on_the_same_images_is_refused(world, judge, name) -> None:
+    scenes = Scenes.of(world, ROBOT, 2, 0)
+    assert scenes.stride < 9
+    with pytest.raises(HMAError, match="is not deterministic: shown the same images again, its actions diff"):
+        score_policy("it", read_policy(f"{__name__}:{name}", scenes), world, scenes, judge, 12)
+
+
+@pytest.mark.parametrize("broken", ["image", "seed", "state"])
 def test_branches_that_do_not_begin_alike_are_refused(world, judge, broken, monkeypatch) -> None:
-    name = {"seed": "random", "state": "reach", "policy": f"{__name__}:unseeded"}.get(
-        broken, f"{__name__}:noisy"
-    )
+    name = {"seed": "random", "state": "reach"}.get(broken, f"{__name__}:noisy")
     made = ModelArena.__init__
 
     def begun(self: ModelArena, *given: Any) -> None:
