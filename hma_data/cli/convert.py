@@ -258,7 +258,12 @@ def _print_dataset_plan(conversion: "Conversion", json: bool) -> None:
     plan, uri = conversion.plan(AS_RECORDED)
     facts = plan.facts["dataset"]
     if json:
-        totals = {"episodes": plan.episodes, "left_out": plan.left_out, "frames": plan.frames}
+        totals = {
+            "episodes": plan.episodes,
+            "left_out": plan.left_out,
+            "frames_in_no_episode": plan.outside,
+            "frames": plan.frames,
+        }
         print_json({"source": uri, "out": str(conversion.out), **totals, **facts, "parts": len(plan.units)})
         return
     parts = human_count(len(plan.units), "part")
