@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
     "hma_data": (744, 4_321, 8),
     "hma_data/cli": (1_549, 11_018, 8),
-    "hma_data/conversion": (4_086, 30_184, 15),
+    "hma_data/conversion": (4_086, 30_181, 15),
     "hma_data/episodes": (1_811, 15_803, 9),
     "hma_data/hub": (517, 3_857, 3),
     "hma_data/inspection": (2_106, 19_984, 8),
@@ -23,7 +23,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/loading": (1_278, 10_753, 6),
     "hma_data/registry": (1_268, 8_248, 6),
     "hma_data/shards": (2_494, 19_183, 11),
-    "hma_data/sources": (12_468, 102_417, 51),
+    "hma_data/sources": (12_472, 102_449, 51),
     "hma_data/storage": (1_697, 11_105, 11),
     "hma_data/tokenizers": (3_459, 25_242, 18),
     "hma_model": (564, 3_409, 4),
@@ -44,7 +44,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_670, 30_166, 20),
     "hma_model/worlds": (1_478, 11_069, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_454, 515_406
+PRODUCT_LINES, PRODUCT_NODES = 65_458, 515_435
 TEST_LINES = 48_393
 DOC_WORDS = 41_999
 

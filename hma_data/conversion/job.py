@@ -155,8 +155,8 @@ class Conversion(Options):
         own_split = any(chosen.column("split").unique().to_pylist())
         # the episodes of one recording all state what is outside of them
         outside = chosen.table.group_by("group").aggregate([("left_out", "max")]).column("left_out_max")
-        plan = replace(plan, left_out=len(refs) - len(chosen), own_split=own_split)
-        return replace(plan, outside=pc.sum(outside).as_py() or 0), uri
+        frames = pc.sum(outside).as_py() or 0
+        return replace(plan, left_out=len(refs) - len(chosen), outside=frames, own_split=own_split), uri
 
     def run(self, on_progress: OnProgress = lambda progress: None) -> Summary:
         """Make the shard set; running it again continues.

@@ -220,7 +220,8 @@ class _BagInspection:
         self.bag, self._name, self._survey = bag, name, survey
         self._frozen: list[str] = []
         self._topics = {
-            topic: _Topic(TopicTrack(topic), count) for topic, count in sorted(bag.topics().items())
+            topic: _Topic(TopicTrack(topic, str(bag.path)), count)
+            for topic, count in sorted(bag.topics().items())
         }
         self._measure(budget)
         self.clocks = {
@@ -241,7 +242,8 @@ class _BagInspection:
             budget.bytes, budget.messages = budget.bytes - len(record.data), budget.messages - 1
             if budget.spent:
                 return
-            topic = self._topics.setdefault(record.channel.topic, _Topic(TopicTrack(record.channel.topic)))
+            name = record.channel.topic
+            topic = self._topics.setdefault(name, _Topic(TopicTrack(name, where)))
             try:
                 message = None if topic.fault else decode(record.channel, record.data, where)
                 topic.track.add(record.channel, record.log_ns, place, message)

@@ -269,7 +269,7 @@ class TopicTrack:
         where: the bag, for errors.
     """
 
-    def __init__(self, topic: str, where: str = "the bag") -> None:
+    def __init__(self, topic: str, where: str) -> None:
         self.topic, self._where = topic, where
         self.columns: list[Column] = []
         self.channels: list[Channel] = []

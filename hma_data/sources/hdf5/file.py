@@ -37,7 +37,7 @@ HELD_DATASETS = 64  # of images that stay open; without chunks they take no byte
 MAX_BYTES = 1 << 30  # of a chunk
 MAX_NUMBERS = 1 << 26  # values read whole; they become float64
 MAX_SINGLE = 1 << 16  # bytes of a single value, such as a text
-MAX_ROW = 1 << 28  # values of a row: more than any image has
+MAX_ROW = 1 << 27  # bytes of a row: more than any image has
 MAX_DEPTH = 4  # of the groups above the episodes
 MAX_GROUPS_SAMPLED = 8  # most groups looked into to see whether they and their like are episodes
 MIN_ENCODED = 64  # bytes a row: no image has fewer
@@ -418,7 +418,8 @@ def dataset(group: h5py.Group, key: str, where: str) -> h5py.Dataset:
         raise EpisodeError(where, f"{key!r} holds no rows, one per frame (shape {found.shape})")
     if not is_plausible(found):
         raise EpisodeError(
-            where, f"{key!r} has shape {found.shape} in chunks {found.chunks}, too large to read"
+            where,
+            f"{key!r} has shape {found.shape} of {found.dtype} in chunks {found.chunks}, too large to read",
         )
     return found
 
@@ -437,8 +438,9 @@ def is_single(found: Any, group: h5py.Group) -> TypeGuard[h5py.Dataset]:
 
 def is_plausible(found: h5py.Dataset) -> bool:
     """Check whether a recording can have rows and chunks of this size."""
-    chunk = np.prod(found.chunks or 0, dtype=float) * found.dtype.itemsize
-    return bool(chunk <= MAX_BYTES and np.prod(found.shape[1:], dtype=float) <= MAX_ROW)
+    chunk, row = np.prod(found.chunks or 0, dtype=float), np.prod(found.shape[1:], dtype=float)
+    each = found.dtype.itemsize
+    return bool(chunk * each <= MAX_BYTES and row * each <= MAX_ROW)
 
 
 def numbers(group: h5py.Group, key: str, where: str) -> Array:

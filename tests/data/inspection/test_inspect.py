@@ -160,7 +160,7 @@ def test_pictures_that_claim_more_than_any_have_are_not_read(tmp_path: Path, sha
     assert peak < 100 << 20
 
 
-@pytest.mark.parametrize("name", ["fps", "instruction"])
+@pytest.mark.parametrize("name", ["fps", "instruction", "data/demo_0/bomb"])
 def test_a_single_value_that_states_many_bytes_is_not_read(tmp_path: Path, name: str) -> None:
     def bomb(file: h5py.File) -> None:
         file.create_dataset(name, (1,), f"S{1 << 28}")

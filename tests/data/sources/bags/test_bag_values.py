@@ -179,7 +179,7 @@ def test_a_stamp_may_be_one_number_near_receipt(unit: int) -> None:
     [([0, 0, 0.1, 0.2], True), ([0, 0, 1.7e9, 1.7e9 + 1], False), ([0.1, 0, 0.2], False), ([0, 0], False)],
 )
 def test_a_simulation_may_begin_at_0(stamps: list[float], are_used: bool) -> None:
-    track = TopicTrack("/cmd")
+    track = TopicTrack("/cmd", "x.bag")
     for i, seconds in enumerate(stamps):
         stamp = {"sec": int(seconds), "nsec": round(seconds % 1 * 1e9)}
         track.add(Channel("/cmd", "", "json"), at(i), (0, 0, i), {"header": {"stamp": stamp}})

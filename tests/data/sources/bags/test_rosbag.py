@@ -116,7 +116,7 @@ def test_messages_out_of_order_come_in_order_of_receipt(tmp_path: Path) -> None:
         expected = [json.loads(message.data)["value"] for _, _, message in make_reader(file).iter_messages()]
     from hma_data.sources.bags.topic_track import TopicTrack
 
-    track, values = TopicTrack("/n"), []
+    track, values = TopicTrack("/n", "x.bag"), []
     for place, record in Bag(path).records():
         message = decode(record.channel, record.data, "")
         track.add(record.channel, record.log_ns, place, message)
