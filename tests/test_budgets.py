@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
     "hma_data": (744, 4_321, 8),
     "hma_data/cli": (1_549, 11_018, 8),
-    "hma_data/conversion": (4_086, 30_181, 15),
+    "hma_data/conversion": (4_087, 30_203, 15),
     "hma_data/episodes": (1_811, 15_803, 9),
     "hma_data/hub": (517, 3_857, 3),
     "hma_data/inspection": (2_106, 19_984, 8),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_670, 30_166, 20),
     "hma_model/worlds": (1_478, 11_069, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_458, 515_435
-TEST_LINES = 48_393
+PRODUCT_LINES, PRODUCT_NODES = 65_459, 515_457
+TEST_LINES = 48_395
 DOC_WORDS = 41_999
 
 

@@ -374,7 +374,8 @@ class _Run:
                 self.beside.holder.clear()
             worst = sorted(reasons.items(), key=lambda item: -item[1])[:3]
             told = "; ".join(f"{count} × {reason}" for reason, count in worst)
-            raise SourceError(self.uri, f"gave no usable episode, so nothing was written: {told}")
+            fault = SourceError(self.uri, f"gave no usable episode, so nothing was written: {told}")
+            raise of_another_format(self.uri, self.given.embodiment.source.format, fault)
         shards = self.given.to == "shards"
         warning, *notes = training_notes(folder, out, plan) if shards else [""]
         if self.hub:

@@ -17,6 +17,7 @@ from hma_data.sources.base import Inspection, open_source
 from hma_data.sources.detect import detect, of_another_format
 from hma_model.cli import app
 from tests.conftest import ARM_YAML, BlockTokenizer, write_toy
+from tests.data.bag_files import arm as bag_robot
 from tests.data.bag_files import make_recording, write_ros1, write_ros2
 from tests.data.sources.rlds.test_rlds import embodiment as rlds_robot
 from tests.data.sources.rlds.test_rlds import toy
@@ -39,6 +40,7 @@ def test_another_format_than_the_yaml_says_is_named(toy_arm: Embodiment, tmp_pat
         (toy_arm, "rlds", "rlds"),
         (toy_arm, "lerobot", "lerobot"),
         (rlds_robot(), "toy.hdf5", "hdf5"),
+        (bag_robot(), "toy.hdf5", "hdf5"),
     ):
         expected = said.format(other, robot.source.format)
         assert converted(robot, str(tmp_path / name), tmp_path / "out").endswith(expected)
