@@ -156,7 +156,7 @@ def turn_back(world: World, scenes: Scenes, probe: Probe, frames: int) -> Arrays
 
     Returns:
         Of each scene (N,): `return_psnr` and `turn_psnr` of the last and the middle image against the first;
-        `return_px` and `turn_px`, the same of the robot's own parts (NaN if none is read); `true_return_px`.
+        `return_px` and `turn_px`, the same of the robot's own parts (NaN if none is read); both `true_…_px`.
     """
     limit = INVERSE_SHARE * np.array([min(-dim.low, dim.high) for dim in scenes.dimensions])
     there = frames // 2
@@ -178,6 +178,7 @@ def turn_back(world: World, scenes: Scenes, probe: Probe, frames: int) -> Arrays
         "return_px": far(probe.read(ends)),
         "turn_px": far(probe.read(turn)),
         "true_return_px": far(np.stack([true.parts[0], true.parts[-1]], axis=1)),
+        "true_turn_px": far(np.stack([true.parts[0], true.parts[there]], axis=1)),
     }
 
 

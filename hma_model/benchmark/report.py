@@ -29,6 +29,12 @@ PLAIN = (  # key of a robot's figures, measure, key or text of the reference, it
     ("error_px", "state error, px of 128", "", ""),
     ("error_px_last", "state error of the last frame, px", "", ""),
     ("decision", "decision fidelity, share of right choices among 5", "chance", "by chance"),
+    (  # a model that stays where it is would otherwise be the most stable
+        "inverse.turn_px",
+        "distance from the start before the inverses, px",
+        "inverse.true_turn_px",
+        "simulator",
+    ),
     (
         "inverse.return_px",
         "distance from the start after actions and their inverses, px",
@@ -59,6 +65,7 @@ RELIABILITY = (
     "RMSE of pixels",
 )
 ABSENT = {  # why a figure is absent though its part was measured
+    "inverse.turn_px": "the probe locates no part",
     "inverse.return_px": "the probe locates no part",
     "calibration.misses": "no error doubles",
     "calibration.false_alarms": "no warnings",
@@ -250,7 +257,12 @@ def compared(one: dict[str, Any], other: dict[str, Any]) -> Table:
         for (key, measure, first, _), (_, _, second, _) in zip(*both, strict=True):
             change = _difference(*(each.get(key) for each in scenes))
             made.append([robot, measure, first, second, change])
-    return Table(("robot", "measure", one["checkpoint"], other["checkpoint"], "second − first"), made)
+    settings = [key for key in ("unmask_steps", "temperature") if one.get(key) != other.get(key)]
+    heads = (
+        ", ".join([each["checkpoint"], *(f"{key.replace('_', ' ')} {each.get(key)}" for key in settings)])
+        for each in (one, other)
+    )
+    return Table(("robot", "measure", *heads, "second − first"), made)
 
 
 def _difference(one: list[Any] | None, other: list[Any] | None) -> str:

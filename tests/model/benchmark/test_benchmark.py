@@ -89,7 +89,7 @@ def test_a_flawless_model_has_every_figure_at_its_best_and_a_frozen_one_guesses(
     assert one["planning"]["verdict"] == "undecided"  # three scenes tell nothing
     assert other["planning"]["truth"] == one["planning"]["truth"]  # the same planner and simulator
     assert one["calibration"] == {"missing": NO_UNCERTAINTY} and "policies" in one
-    assert other["inverse"]["return_px"] == other["inverse"]["turn_px"] == 0
+    assert other["inverse"]["return_px"] == other["inverse"]["turn_px"] == 0 < one["inverse"]["true_turn_px"]
 
 
 class Blind(KnownPlaces):
@@ -246,6 +246,8 @@ def test_the_card_the_page_and_a_comparison(folders, tmp_path, capsys) -> None:
     rare = {"0.00 (-0.55 to 0.55)"}  # outcomes that agree in so few scenes may differ in others
     assert same["decision fidelity, share of right choices among 5"] in rare
     assert set(same.values()) <= {"", "0.00 (0.00 to 0.00)"} | rare
+    slow = compared(one, {**one, "unmask_steps": 8})  # the same checkpoint, decoded otherwise
+    assert slow.columns[2:4] == tuple(f"{one['checkpoint']}, unmask steps {steps}" for steps in (2, 8))
     assert main(["benchmark", "--compare", *map(str, folders), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)[0]["robot"] == ROBOT
     with pytest.raises(UsageError, match="differ in seed"):
