@@ -50,6 +50,7 @@ from hma_data.shards.schema import RowLayout, to_numpy
 from hma_data.sources.base import EpisodeRef, open_source
 from hma_data.sources.common.choice import chosen_ids, ids_for_robot
 from hma_data.sources.detect import of_another_format, require_utf8
+from hma_data.sources.lerobot.metadata import Folder
 from hma_data.sources.lerobot.writer import origin_of
 from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_text
@@ -149,7 +150,7 @@ class Conversion(Options):
             chosen = refs.take(to_numpy(pc.is_in(refs.column("id"), kept)))
         plan = make_plan(chosen, robot, tokenizer, settings, uri)
         if form == "lerobot":
-            plan = plan.with_origin(origin_of(place(uri)))
+            plan = plan.with_origin(origin_of(Folder(uri).path))
         if self.to == "lerobot":
             plan = with_dataset(plan, uri, robot)
         own_split = any(chosen.column("split").unique().to_pylist())

@@ -27,14 +27,18 @@ ORIGIN = "synthetic.json"  # beside a dataset whose episodes no robot recorded: 
 SYNTHETIC = "synthetic"  # a column of 1 in lerobot's own recordings of an evaluation in a model
 
 
-def origin_of(folder: Path) -> dict[str, Any]:
-    """Return what made the episodes of a dataset: `made_by` of the plan of shards; empty for a recording."""
-    path, info = folder / ORIGIN, folder / "meta" / "info.json"
+def origin_of(find: Callable[[str], Path]) -> dict[str, Any]:
+    """Return what made the episodes of a dataset: `made_by` of the plan of shards; empty for a recording.
+
+    Args:
+        find: returns the path of a file of the dataset, which need not exist.
+    """
+    path, info = find(ORIGIN), find("meta/info.json")
     if path.is_file():
         return read_json(path, SourceError)
     if not info.is_file() or SYNTHETIC not in read_json(info, SourceError).get("features", {}):
         return {}
-    ranges = read_json(folder / "meta" / "stats.json", SourceError).get(SYNTHETIC, {})
+    ranges = read_json(find("meta/stats.json"), SourceError).get(SYNTHETIC, {})
     return {"by": "lerobot-eval", "synthetic": True} if ranges.get("max") == [1.0] else {}
 
 

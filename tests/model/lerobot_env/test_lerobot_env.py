@@ -224,7 +224,7 @@ def test_lerobot_eval_and_its_recording(tmp_path: Path) -> None:
     facts = json.loads((recorded / "meta" / "info.json").read_text())
     assert facts["total_frames"] == 10 and facts["fps"] == HMAEnvConfig(embodiment=ROBOT).fps
     assert {"pixels", "agent_pos", "action", "synthetic", "next.success"} <= facts["features"].keys()
-    assert origin_of(recorded) == {"by": "lerobot-eval", "synthetic": True}
+    assert origin_of(recorded.joinpath) == {"by": "lerobot-eval", "synthetic": True}
     assert "no judge is given, so pc_success will be 0" in found.stderr
 
 

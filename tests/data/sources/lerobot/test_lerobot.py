@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from hma_data.conversion.job import convert
 from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.embodiment import Embodiment, find
@@ -234,7 +235,7 @@ def test_a_recording_of_an_evaluation_in_a_model_is_synthetic(highest, made_by, 
     (tmp_path / "meta").mkdir()
     (tmp_path / "meta" / "info.json").write_text(json.dumps({"features": {"synthetic": {"shape": [1]}}}))
     (tmp_path / "meta" / "stats.json").write_text(json.dumps({"synthetic": {"max": [highest]}}))
-    assert origin_of(tmp_path) == made_by
+    assert origin_of(tmp_path.joinpath) == made_by
 
 
 # -- datasets of the hub
@@ -329,8 +330,6 @@ def test_what_the_hub_does_not_have_is_one_line(hub: Hub, uri: str) -> None:
 
 
 def test_a_file_the_hub_lacks_is_one_refused_episode(hub, folders, tmp_path) -> None:
-    import shutil
-
     copy = Path(shutil.copytree(folders["v2"], tmp_path / "copy"))
     (copy / f"videos/chunk-000/{CAMERA}/episode_000001.mp4").unlink()
     hub.add_folder("team/holes", "main", copy)
@@ -339,6 +338,18 @@ def test_a_file_the_hub_lacks_is_one_refused_episode(hub, folders, tmp_path) -> 
     with pytest.raises(EpisodeError, match=r"episode_000001\.mp4: no such video"):
         source.read("team/holes", "episode_000001", embodiment())
     assert source.read("team/holes", "episode_000002", embodiment()).id == "episode_000002"
+
+
+def test_a_synthetic_dataset_of_the_hub_is_known_as_one(hub, folders, tmp_path, block_tokenizer) -> None:
+    copy = Path(shutil.copytree(folders["v2"], tmp_path / "copy"))
+    (copy / "synthetic.json").write_text('{"synthetic": true}')
+    hub.add_folder("team/made", "main", copy)
+    done = convert(embodiment(), "team/made", block_tokenizer, tmp_path / "shards")
+    assert done.manifest.plan["made_by"] == {"synthetic": True}
+    (copy / "synthetic.json").replace(tmp_path / "elsewhere.json")
+    (copy / "synthetic.json").symlink_to(tmp_path / "elsewhere.json")
+    with pytest.raises(EpisodeError, match=r"synthetic\.json: is a link to a file outside"):
+        convert(embodiment(), str(copy), block_tokenizer, tmp_path / "linked")
 
 
 def test_a_name_on_the_hub_is_known_as_a_lerobot_dataset() -> None:
