@@ -46,7 +46,8 @@ export function note(text, stay = 4500) {  // says something for a while; with 0
 export function showMeter(found, title, absent) {  // the error that the model expects of itself
   const warns = Boolean(found && found.warns), meter = document.getElementById("meter");
   for (const place of [meter, document.getElementById("stage")]) place.classList.toggle("warns", warns);
-  meter.textContent = found ? (warns ? "unsure: " : "") + "error ≈ " + found.px.toFixed(1) + " px" : absent;
+  const error = found && `error ${found.beyond ? ">" : "≈"} ${found.px.toFixed(1)} px`;
+  meter.textContent = found ? (warns ? "unsure: " : "") + error : absent;
   meter.title = title;
 }
 

@@ -229,11 +229,15 @@ class Session:
 
     @property
     def metered(self) -> dict[str, Any] | None:
-        """Return the state error to expect in the newest frame, and whether to warn; None without a meter."""
+        """Return the state error to expect in the newest frame, and whether to warn; None without a meter.
+
+        `beyond`: the model is less certain than in any calibrated group of frames, so that the error is more.
+        """
         if self.meter is None or not math.isfinite(self._stated):
             return None
         stated = np.array(self._stated)
-        return {"px": round(float(self.meter.expected(stated)), 1), "warns": bool(self.meter.warns(stated))}
+        px, warns = round(float(self.meter.expected(stated)), 1), bool(self.meter.warns(stated))
+        return {"px": px, "beyond": self._stated > self.meter.stated[-1], "warns": warns}
 
     @property
     def _state(self) -> Float32s | None:

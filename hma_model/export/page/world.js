@@ -153,10 +153,10 @@ export class World {  // one robot
   metered(meter) {  // the state error to expect, and whether to warn; null if the frames are not all of the calibrated kind
     if (!meter || !Number.isFinite(this.unsure)) return null;
     const stated = this.unsure ** (1 / POWER), { stated: at, error_px: px } = meter;
-    const i = at.findIndex((one) => one >= stated);
-    if (i <= 0) return { px: i ? px[px.length - 1] : px[0], warns: stated >= meter.limit };
+    const i = at.findIndex((one) => one >= stated), beyond = i < 0, warns = stated >= meter.limit;
+    if (i <= 0) return { px: beyond ? px[px.length - 1] : px[0], beyond, warns };
     const share = (stated - at[i - 1]) / (at[i] - at[i - 1]);
-    return { px: px[i - 1] + share * (px[i] - px[i - 1]), warns: stated >= meter.limit };
+    return { px: px[i - 1] + share * (px[i] - px[i - 1]), beyond, warns };
   }
 
   nothing() { return Object.fromEntries(this.manifest.state.map((one) => [one.name, numbers(one)])); }  // the state before any frame

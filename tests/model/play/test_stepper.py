@@ -160,16 +160,19 @@ def test_the_meter_of_uncertainty_warns_until_a_sync_and_is_refused_if_no_better
         found.append(session.metered)
     assert bench.world.decoding.measure
     roots = [1.5 * count**0.25 for count in (1, 2, 3, 4)]
-    assert found == [{"px": round(1 + 2 * root, 1), "warns": root >= 2} for root in roots]
+    assert found == [{"px": round(1 + 2 * root, 1), "beyond": False, "warns": root >= 2} for root in roots]
+    bench.world.uncertainty[session.row] = 5.0
+    bench.step()
+    assert session.metered == {"px": 9.0, "beyond": True, "warns": True}
     session.sync()
-    assert session.metered == {"px": 1.0, "warns": False}
+    assert session.metered == {"px": 1.0, "beyond": False, "warns": False}
     session.sample(replace(session.sampling, unmask_steps=3))
     assert session.metered is None and "may be no better" in session.status()["unmetered"]
     bench.step()
     session.sample(replace(session.sampling, unmask_steps=2))
     assert session.metered is None  # a frame was not measured
     session.begin(0)
-    assert session.metered == {"px": 1.0, "warns": False}
+    assert session.metered == {"px": 1.0, "beyond": False, "warns": False}
 
 
 def test_sync_restarts_the_model_from_the_true_frames_and_their_actions() -> None:
