@@ -125,7 +125,9 @@ class Mixture:
         for label in dict.fromkeys(group.values()) if groups else ():
             members = np.array([group[name] == label for name in counts])
             if share[members].sum() > 0:
-                factor = 1.0 if label in counts else weights.get(label, 1.0)
+                # Where a group has the name of a member, the weight of that name is the member's.
+                within = label in counts and label in groups.values()
+                factor = 1.0 if within else weights.get(label, 1.0)
                 share[members] *= factor / share[members].sum()
         if share.sum() <= 0:
             raise UsageError("mixture weights", "leave nothing to draw", "give a weight above 0")

@@ -114,6 +114,8 @@ def test_sets_of_a_group_share_one_weight() -> None:
     np.testing.assert_allclose(heavier.p, [0.25, 0.075, 0.675])
     within = Mixture.of(counts, 1, groups=groups, weights={"left": 9})
     np.testing.assert_allclose(within.p, [0.5, 0.25, 0.25])
+    alone = Mixture.of(counts, 1, groups=groups, weights={"arm": 3})
+    np.testing.assert_allclose(alone.p, [0.75, 0.025, 0.225])
 
 
 def test_no_set_is_passed_over_more_often_than_allowed() -> None:
