@@ -44,7 +44,7 @@ from hma_data.shards.manifest import (
 )
 from hma_data.shards.schema import RowLayout, to_numpy
 from hma_data.sources.base import EpisodeRef, Source
-from hma_data.storage.records import Records
+from hma_data.storage.records import Records, with_columns
 
 log = logging.getLogger(__name__)
 
@@ -96,6 +96,10 @@ def extended(
     new = now.filter(pc.and_not(pc.is_null(place), pc.is_in(now["id"], refused)))
     if not len(new):
         return Plan((), base.plan)
+    # The rest of a recording of which the set has a part, as with --limit, goes into the same split.
+    parts = there.episodes.filter(pc.not_equal(there.episodes["group"], ""))
+    theirs = parts["split"].take(pc.index_in(new["group"], parts["group"]))
+    new = with_columns(new, split=pc.coalesce(theirs, new["split"]))
     return _with(base, Records(EpisodeRef, new), len(known) + len(refused), shard_frames)
 
 

@@ -6,11 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hma_data.conversion.plan import Settings
 from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.embodiment import Embodiment
+from hma_data.shards.reader import ShardSet
 from hma_data.sources.bags import segments
 from tests.command import hma
+from tests.conftest import convert_toy
 from tests.data.bag_files import SOURCE, START_NS
 from tests.data.bag_parts import KINDS, STATE, TASK, Said, make_run, parted, ros1
 
@@ -45,6 +48,17 @@ def test_a_pause_parts_every_kind_of_bag(kind: str, tmp_path: Path) -> None:
         np.testing.assert_array_equal(stream.frames(range(stop - begin)), run.pictures[begin:stop])
         np.testing.assert_allclose(stream.timestamps, START_NS / 1e9 + run.times[begin:stop], atol=1e-6)
         assert episode.id == ref.id
+
+
+def test_a_bag_of_which_a_limited_set_has_a_part_stays_in_one_split(tmp_path: Path) -> None:
+    (tmp_path / "bags").mkdir()
+    for name in "abc":
+        ros1(tmp_path, make_run(30, pause_after=(15,))).rename(tmp_path / "bags" / f"{name}.bag")
+    for limit, extend in ((3, False), (None, True)):
+        convert_toy(parted(GAP), tmp_path / "bags", tmp_path / "out", Settings(limit=limit), extend=extend)
+    rows = ShardSet(tmp_path / "out").episodes.to_pylist()
+    splits = {(row["group"], row["split"]) for row in rows}
+    assert splits == {("a", "train"), ("b", "val"), ("c", "val")}
 
 
 @pytest.mark.parametrize("kind", KINDS)
