@@ -172,7 +172,7 @@ def merge(
         out: str or path of the new set, or its URI.
 
     Raises:
-        ShardError: the sets cannot be merged.
+        ShardError: the sets cannot be merged, or an episode would be in train and in val.
         OutputError: `out` holds something else, or another job is writing it.
     """
     sets = [ShardSet(folder) for folder in folders]
@@ -181,6 +181,7 @@ def merge(
     for other in sets[1:]:
         _check_alike(first, other)
     episodes, refused = _joined([_rows(shards) for shards in sets], [_refused(shards) for shards in sets])
+    _refuse_leak(out, episodes)
     made_by: dict[str, Any] = {"merge": [shards.manifest.plan["hash"] for shards in sets]}
     for mark in SYNTHETIC_MARKS:  # of some of the episodes is of the set
         if any(shards.manifest.plan.get("made_by", {}).get(mark) for shards in sets):
@@ -194,6 +195,16 @@ def merge(
         sets, embodiment, settings, episodes, pa.repeat("", len(episodes)), source, refused, made_by
     )
     return job.run(out, workers, on_progress)
+
+
+def _refuse_leak(out: StrPath, episodes: pa.Table) -> None:
+    """Raise ShardError if an episode of val is in train too, from another of the sets."""
+    known = episodes.filter(pc.not_equal(episodes["content"], ""))
+    held = pc.equal(known["split"], "val")
+    twice = pc.is_in(known["content"], known["content"].filter(held))
+    if ids := known["id"].filter(pc.and_not(twice, held)).to_pylist():
+        fault = f"would have {len(ids):,} episodes in train that are also in val, first {ids[0]!r}"
+        raise ShardError(out, fault, "leave them out of one of the sets: hma convert --exclude")
 
 
 def _joined(

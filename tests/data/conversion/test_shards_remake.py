@@ -113,6 +113,13 @@ def test_merge_holds_every_episode_of_every_set_in_its_split(made: Path, tmp_pat
     assert table["split"].to_pylist() == splits
 
 
+def test_merge_refuses_to_train_on_what_another_set_holds_out(made: Path, tmp_path: Path) -> None:
+    split(made, tmp_path / "again", val_fraction=0.5, seed=3)
+    with pytest.raises(ShardError, match=r"all: would have \d+ episodes in train that are also in val"):
+        merge([made, tmp_path / "again"], tmp_path / "all")
+    assert not (tmp_path / "all").exists()
+
+
 def test_merged_statistics_are_those_of_all_train_rows(made: Path, tmp_path: Path) -> None:
     other = make(tmp_path / "other", [11, 12, 13])
     manifest = merge([made, other], tmp_path / "all", workers=2)
