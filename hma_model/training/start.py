@@ -9,6 +9,7 @@ With a frozen trunk, the run's checkpoints keep the same files of the trunk and,
 machine, of all other robots. With a tuned trunk they leave out the other robots, which belong to the old one.
 """
 
+import shutil
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +25,7 @@ from hma_data.storage.files import read_json
 from hma_data.storage.paths import addressed, is_repository
 from hma_model.checkpoint import io as checkpoints
 from hma_model.checkpoint import weights as stored
-from hma_model.checkpoint.folder import README, Checkpoint, require_tokenizer, resolve
+from hma_model.checkpoint.folder import README, Checkpoint, require_tokenizer, resolve, training_checkpoints
 from hma_model.config import HMAConfig
 from hma_model.network.model import HMA
 from hma_model.network.stem import waves_of_stem
@@ -53,7 +54,7 @@ class Start:
 
     @classmethod
     def bring(cls, recipe: Recipe, sets: Mapping[str, ShardSet], out: Path) -> None:
-        """Fetch the recipe's checkpoint into the run's folder, unless it is there already.
+        """Fetch the recipe's checkpoint into the run's folder, unless the run has begun from it.
 
         Raises:
             HubError, CheckpointError: the checkpoint does not exist, or is damaged.
@@ -63,9 +64,10 @@ class Start:
 
         assert recipe.start is not None
         place = out / START
-        if (place / README).is_file():  # written last
+        if training_checkpoints(out) and (place / README).is_file():  # written last
             _require_source(recipe.start, out)
             return
+        shutil.rmtree(place, ignore_errors=True)  # nothing is trained yet: it may be of another source
         source, revision = addressed(recipe.start)
         local = not is_repository(source) and "://" not in source
         if local:

@@ -3,6 +3,7 @@
 import json
 import shutil
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -22,6 +23,7 @@ from hma_model.network.stem import Stem
 from hma_model.training import new_stem
 from hma_model.training.loop import TrainResult, finetune, train
 from hma_model.training.recipe import make_recipe
+from hma_model.training.run import Run
 from tests.conftest import contents as files
 from tests.hostile import flip
 from tests.hub_state import REPO, ROBOTS
@@ -211,6 +213,17 @@ def test_another_source_is_no_way_to_go_on_and_the_same_one_elsewhere_is(base, l
     other = tune(base.out, leg, tmp_path / "other", freeze=False)
     with pytest.raises(RecipeError, match=f"was started from .*moved, not from {other.out}"):
         tune(other.out, leg, tmp_path / "run", force=True)
+
+
+def test_a_run_stopped_before_its_first_checkpoint_begins_from_the_source_now_named(
+    base, leg, tmp_path, monkeypatch
+):
+    other = tune(base.out, leg, tmp_path / "other", freeze=False)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Run, "resume", Mock(side_effect=KeyboardInterrupt))
+        tune(base.out, leg, tmp_path / "run")
+    tune(other.out, leg, tmp_path / "run")
+    assert Checkpoint.open(tmp_path / "run").trunk_sha256 == Checkpoint.open(other.out).trunk_sha256
 
 
 def test_a_damaged_source_is_named_and_leaves_no_folder(base, leg, tmp_path):
