@@ -19,9 +19,11 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from torch import Tensor
 
 from hma_data.errors import CheckpointError, RecipeError
+from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_data.storage.files import file_sha256, finite, read_json, short_sha256, to_json
 from hma_model.checkpoint.folder import CONFIG, FORMAT_VERSION, HEAD, STEM, TRAINING, Checkpoint, inside
@@ -78,6 +80,15 @@ def require_network(before: HMAConfig, now: HMAConfig, where: object) -> None:
             names = f"{old.get('name')!r}, now {new.get('name')!r}"
             fault = f"was started with another tokenizer: {names} or other weights of it"
         raise RecipeError(where, fault, "train into another folder; --force cannot accept this")
+
+
+def other_actions(known: Embodiment, now: Embodiment) -> str:
+    """Return how a robot's actions differ from those that its stem was trained with; empty if not."""
+    for key in ("action_dim", "stride", "normalize_mask"):
+        old, new = getattr(known, key), getattr(now, key)
+        if not np.array_equal(old, new):
+            return f"{now.id} with {key} {old}, the shards have {new}"
+    return ""
 
 
 def seed_for(seed: int, what: str, *index: int) -> int:

@@ -41,6 +41,7 @@ from hma_model.training.resume import (
     RunState,
     TrainingState,
     data_digests,
+    other_actions,
     read_training_state,
     require_network,
     require_version,
@@ -448,6 +449,10 @@ class Run:
         if not force:
             state.require_same(self.recipe.identity(), self.digests, self.out)
         require_network(checkpoint.config, self.model.config, self.out)
+        for name in set(self.sets) & set(checkpoint.embodiments):
+            if other := other_actions(checkpoint.embodiment(name), self.sets[name].embodiment):
+                remedy = "undo the change in its YAML, or train into another folder"
+                raise RecipeError(self.out, f"was started on {other}", remedy)
         notes = self._adopt(checkpoint)
         kept.fill(self.model)
         for name in set(self.sets) & set(checkpoint.embodiments):

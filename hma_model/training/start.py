@@ -15,8 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from hma_data.errors import CheckpointError, RecipeError
 from hma_data.loading.views import view_count
 from hma_data.registry.embodiment import Embodiment
@@ -32,7 +30,7 @@ from hma_model.network.stem import waves_of_stem
 from hma_model.training.colors import carried, recolored
 from hma_model.training.new_stem import FETCHED, candidates
 from hma_model.training.recipe import Recipe
-from hma_model.training.resume import TRAINED_BY
+from hma_model.training.resume import TRAINED_BY, other_actions
 from hma_model.training.runtime import RECIPE, START
 
 # fields that a run may turn on for a checkpoint's trunk, and their parameters, which change nothing at first
@@ -136,12 +134,8 @@ class Start:
         name = shards.embodiment.id
         if name not in self.checkpoint.embodiments:
             return shards.manifest.stats
-        theirs, ours = self.checkpoint.embodiment(name), shards.embodiment
-        for key in ("action_dim", "stride", "normalize_mask"):
-            a, b = getattr(theirs, key), getattr(ours, key)
-            if not np.array_equal(a, b):
-                fault = f"has {name} with {key} {a}, the shards have {b}"
-                raise CheckpointError(self.source, fault, "give the robot of the shards another id")
+        if other := other_actions(self.checkpoint.embodiment(name), shards.embodiment):
+            raise CheckpointError(self.source, f"has {other}", "give the robot of the shards another id")
         return self.checkpoint.stats(name)
 
     def waves(self, robot: Embodiment, recipe: Recipe) -> int | None:

@@ -283,6 +283,12 @@ def test_not_even_force_goes_on_with_another_tokenizer(averaged, whole, tmp_path
         train(averaged(data=[str(shards)], steps=8), out=whole, show=False, force=True)
 
 
+def test_not_even_force_goes_on_with_other_actions(averaged, whole, tmp_path):
+    shards = make_shards(tmp_path / "arm", "arm", dims=5)
+    with pytest.raises(RecipeError, match="was started on arm with action_dim 2, the shards have 5"):
+        train(averaged(data=[str(shards)], steps=8), out=whole, show=False, force=True)
+
+
 @pytest.mark.parametrize("out", [None, "", " "])
 def test_what_cannot_be_a_folder_is_wrong_usage(averaged, out):
     with pytest.raises(UsageError, match="out: is not given"):
