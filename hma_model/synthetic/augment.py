@@ -219,7 +219,12 @@ def augment(
             batches = maker.run(kept, on_progress)
             spec = world.tokenizer.spec
             chosen = _chosen(batches, settings, UNCERTAINTY_FLAGS[spec.kind], meter)
-            found = write_shards(folder, chosen, spec, maker.robot, made_by, cameras=maker.cameras)
+            # What begins with held-out frames is held out: merged with the recordings, it would leak them.
+            rows = [] if begins is None else begins.episodes.to_pylist()
+            splits = {row["group"] or row["id"]: row["split"] for row in rows}
+            found = write_shards(
+                folder, chosen, spec, maker.robot, made_by, cameras=maker.cameras, splits=splits
+            )
         remove_kept(folder / WORK)  # a job may have been killed here
         if dataset is not None and not done:
             made = settings.episodes * settings.frames

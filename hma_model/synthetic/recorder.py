@@ -7,7 +7,7 @@ T frames, V views stacked along the height, K = stride * action dim.
 """
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -85,6 +85,7 @@ def write_shards(
     origin: str = ORIGIN,
     refused: Sequence[Refused] = (),
     cameras: Sequence[str] = (),
+    splits: Mapping[str, str] | None = None,
 ) -> Manifest:
     """Write the shards of episodes; a frame without actions after it, the last one, is no row.
 
@@ -96,10 +97,11 @@ def write_shards(
         origin: how the episodes came about, in words.
         refused: other episodes, which go to quarantine; the first shard states them.
         cameras: V names, whose images they show from the top; the primary one by default.
+        splits: group -> split of its episodes; without them it is chosen as in a conversion.
     """
-    own = described_as(robot, origin)
+    own, known = described_as(robot, origin), splits or {}
     refs = [
-        EpisodeRef(one.id, len(one.chunks) * own.stride, None, str(number), one.group)
+        EpisodeRef(one.id, len(one.chunks) * own.stride, known.get(one.group), str(number), one.group)
         for number, one in enumerate(episodes)
     ]
     settings = Settings(frames="strided", cameras=tuple(cameras))

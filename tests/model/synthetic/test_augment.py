@@ -11,7 +11,7 @@ import pytest
 
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
-from hma_data.conversion.rewrite import merge
+from hma_data.conversion.rewrite import merge, split
 from hma_data.errors import HMAError, OutputError, ShardError, UsageError
 from hma_data.lab import family, record
 from hma_data.registry.embodiment import Embodiment
@@ -195,6 +195,15 @@ def test_first_frames_and_actions_come_from_shards(world: World, real: Path, tmp
         assert any(np.array_equal(one, columns["action"].ravel()) for one in rows)
     with pytest.raises(UsageError, match="has no episode of 2 \\+ 900 frames"):
         augment(tmp_path / "no", asked(frames=900), world=world, shards=real)
+
+
+def test_an_episode_is_in_the_split_of_the_recording_with_which_it_begins(world, tmp_path) -> None:
+    convert(family.embodiment(ROBOT), record(ROBOT, tmp_path, 4), world.tokenizer, tmp_path / "whole")
+    split(tmp_path / "whole", tmp_path / "real", val_fraction=0.5, seed=1)
+    augment(tmp_path / "out", asked(source="real"), world=world, shards=tmp_path / "real")
+    real, made = (ShardSet(tmp_path / name).episodes.to_pylist() for name in ("real", "out"))
+    splits = {row["id"]: row["split"] for row in real}
+    assert {row["group"]: row["split"] for row in made} == splits and len(set(splits.values())) == 2
 
 
 @pytest.mark.slow
