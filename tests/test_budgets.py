@@ -15,12 +15,12 @@ ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
     "hma_data": (744, 4_321, 8),
     "hma_data/cli": (1_549, 11_018, 8),
-    "hma_data/conversion": (4_088, 30_207, 15),
+    "hma_data/conversion": (4_103, 30_408, 15),
     "hma_data/episodes": (1_811, 15_803, 9),
     "hma_data/hub": (517, 3_857, 3),
     "hma_data/inspection": (2_106, 19_984, 8),
     "hma_data/lab": (3_300, 29_290, 16),
-    "hma_data/loading": (1_278, 10_753, 6),
+    "hma_data/loading": (1_280, 10_769, 6),
     "hma_data/registry": (1_268, 8_248, 6),
     "hma_data/shards": (2_494, 19_183, 11),
     "hma_data/sources": (12_476, 102_450, 51),
@@ -40,12 +40,12 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/play": (1_607, 11_842, 8),
     "hma_model/policies": (2_855, 20_420, 14),
     "hma_model/released": (807, 6_817, 4),
-    "hma_model/synthetic": (1_206, 9_272, 5),
-    "hma_model/training": (3_670, 30_166, 20),
+    "hma_model/synthetic": (1_213, 9_354, 5),
+    "hma_model/training": (3_682, 30_266, 20),
     "hma_model/worlds": (1_478, 11_069, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_481, 515_604
-TEST_LINES = 48_411
+PRODUCT_LINES, PRODUCT_NODES = 65_517, 516_003
+TEST_LINES = 48_462
 DOC_WORDS = 41_999
 
 
