@@ -95,13 +95,14 @@ async function isolate() {  // a service worker keeps files for offline use; loa
   return true;
 }
 
-async function prune() {  // forget the files of an older export
+async function prune() {  // forget the files of an older export here; other pages of this host keep theirs
   if (!self.caches) return;
   const versions = new Set([manifest.runtime.version, ...[...Object.values(manifest.page), ...manifest.robots.flatMap((one) => [one.stem, ...(one.replays ? one.replays.strips : [])])].map((part) => part.sha256.slice(0, 12))]);
-  const cache = await caches.open("hma-export");
+  const cache = await caches.open("hma-export"), folder = new URL(".", location).href;
   for (const request of await cache.keys()) {
     const version = new URL(request.url).searchParams.get("v");
-    if (version && !versions.has(version)) await cache.delete(request);
+    const own = request.url.startsWith(folder) && /^(page-|robots\/|ort\/)/.test(request.url.slice(folder.length));
+    if (own && version && !versions.has(version)) await cache.delete(request);
   }
 }
 

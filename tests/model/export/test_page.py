@@ -158,6 +158,26 @@ def test_200_frames_driven_by_keys_are_those_of_onnxruntime_and_it_works_offline
     page.wait_for_function("Number(document.body.dataset.frame) >= 1")
 
 
+def test_files_of_an_older_export_are_forgotten_and_those_of_other_pages_are_kept(page, server) -> None:
+    folder = address(server).partition("?")[0]
+    ends = ("page-step.onnx", "robots/it/stem.onnx", "arms/page-step.onnx", "../page-step.onnx")
+    page.goto(f"{folder}manifest.json")
+    page.evaluate(
+        """async (urls) => {
+          const cache = await caches.open("hma-export");
+          for (const url of urls) await cache.put(url, new Response("it"));
+        }""",
+        [f"{folder}{end}?v=older" for end in ends],
+    )
+    page.goto(address(server))
+    page.wait_for_selector("#veil", state="hidden")
+    kept = page.evaluate(
+        "caches.open('hma-export').then((one) => one.keys()).then((all) => all.map((one) => one.url))"
+    )
+    older = [url.removesuffix("?v=older") for url in kept if url.endswith("?v=older")]
+    assert older == [f"{folder}arms/page-step.onnx", f"{folder.removesuffix('page/')}page-step.onnx"]
+
+
 def test_the_temperature_begins_as_the_manifest_says(page: "Page", server: Any, site: Path) -> None:
     about = site / "sub" / "page" / "manifest.json"
     about.write_text(json.dumps(json.loads(about.read_text()) | {"temperature": 0.2}))
