@@ -139,6 +139,8 @@ def _write_parts(folder: Path, step: StepGraph) -> dict[str, Any]:
 def _meter(world: World, robot: str, unmask_steps: int) -> dict[str, Any]:
     """Return what the page needs to tell how unsure the model is of a robot, or why it does not."""
     meter, reason = world.meter(robot, unmask_steps=unmask_steps)
+    if meter is not None and not world.model.config.discrete:  # `hma play` draws a frame twice for it
+        return {"meter": None, "unmetered": "this page measures no uncertainty of latents: hma play does"}
     if meter is None or not meter.better:
         return {"meter": None, "unmetered": reason if meter is None else meter.verdict}
     return {"meter": asdict(meter) | {"verdict": meter.verdict}, "unmetered": ""}

@@ -242,7 +242,9 @@ async function show(current, made, { number, chunk, followed, shapes, error, beg
 }
 
 function metered(found = world.metered(robot.meter)) {
-  showMeter(found, robot.meter ? robot.meter.verdict : robot.unmetered, "no error meter");
+  const { meter, unmetered } = robot;
+  const other = meter && !found && `uncertainty is calibrated only for temperature ${meter.temperature}: set it, and press Reset`;
+  showMeter(found, other || (meter ? meter.verdict : unmetered), "no error meter");
 }
 
 function size(width, height) { const view = $("view"); if (view.width !== width || view.height !== height) { view.width = width; view.height = height; } }

@@ -7,6 +7,7 @@ import shutil
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from hma_model.checkpoint.io import load
 from hma_model.cli.export import export_checkpoint
 from hma_model.evaluation.metrics import psnr
 from hma_model.export.files import rounded
+from hma_model.export.folder import _meter
 from hma_model.export.graphs import require_exportable
 from hma_model.export.truth import table_values
 from hma_model.generation.decode import decode
@@ -30,6 +32,7 @@ from hma_model.generation.rollout import Rollout
 from hma_model.worlds.scenes import LabRobot
 from tests.command import hma
 from tests.model.export.checkpoints import ROBOT, Driver, drawn_as_torch
+from tests.model.play.test_stepper import METER
 from tests.model.true_world import BlockLatents, latent_model
 
 pytestmark = pytest.mark.slow  # exporting a graph takes a quarter of a minute
@@ -109,6 +112,12 @@ def test_the_manifest_says_how_to_drive_and_its_digests_fit(tokens: Path) -> Non
         assert (len(content), hashlib.sha256(content).hexdigest()) == (part["bytes"], part["sha256"])
     assert np.load(tokens / robot["frames"]).shape[:2] == (3, 4) and len(robot["held"]) == 3
     assert all((tokens / picture).is_file() for picture in robot["pictures"])
+
+
+def test_a_page_whose_graphs_measure_no_uncertainty_has_no_meter() -> None:
+    world: Any = SimpleNamespace(meter=lambda *_, **way: (METER, ""), model=latent_model(ROBOT))
+    about = _meter(world, ROBOT, 2)
+    assert about["meter"] is None and "hma play" in about["unmetered"]
 
 
 def test_replays_hold_recorded_commands_and_the_page_begins_where_they_do(tokens: Path) -> None:

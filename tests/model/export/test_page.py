@@ -9,6 +9,7 @@ import subprocess
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +27,7 @@ from hma_model.export.starts import Start
 from recipes.bench.page import run, served
 from tests.browser_fixtures import EMULATED_GPU, FLAGS
 from tests.model.export.checkpoints import ROBOT, Driver
+from tests.model.play.test_stepper import METER
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -178,12 +180,20 @@ def test_files_of_an_older_export_are_forgotten_and_those_of_other_pages_are_kep
     assert older == [f"{folder}arms/page-step.onnx", f"{folder.removesuffix('page/')}page-step.onnx"]
 
 
-def test_the_temperature_begins_as_the_manifest_says(page: "Page", server: Any, site: Path) -> None:
+def test_the_temperature_begins_as_the_manifest_says_and_the_meter_is_of_it(page, server, site) -> None:
     about = site / "sub" / "page" / "manifest.json"
-    about.write_text(json.dumps(json.loads(about.read_text()) | {"temperature": 0.2}))
+    manifest = json.loads(about.read_text()) | {"temperature": 0.2}
+    manifest["robots"][0]["meter"] = asdict(METER) | {"temperature": 0.2, "verdict": "it warns"}
+    about.write_text(json.dumps(manifest))
     page.goto(address(server))
     page.wait_for_selector("#veil", state="hidden")
     assert page.input_value("#temperature") == "0.2" and page.text_content("#temperature-out") == "0.2"
+    assert page.get_attribute("#meter", "title") == "it warns"
+    page.fill("#temperature", "1")
+    page.click("#step")
+    page.wait_for_selector(
+        "#meter[title='uncertainty is calibrated only for temperature 0.2: set it, and press Reset']"
+    )
 
 
 def test_a_replay_shows_the_true_images_until_a_person_drives(page: "Page", server: Any, site: Path) -> None:
