@@ -149,10 +149,11 @@ def cache_folder() -> Path:
 def new_folder(folder: Path) -> Iterator[Path]:
     """Yield an empty folder to fill; it gets the given name when the block ends without an error.
 
-    It replaces an older folder of that name. On an error the new folder is deleted and the older one stays as
-    it was. What a killed writer of that name left on this machine is deleted too.
+    It replaces an older folder of that name; of a link, the folder that it points to. On an error the new
+    folder is deleted and the older one stays as it was. What a killed writer of that name left on this machine
+    is deleted too.
     """
-    folder = folder.absolute()
+    folder = folder.resolve()
     folder.parent.mkdir(parents=True, exist_ok=True)
     # Another machine that shares the disk may be writing it too, and its processes are not seen here.
     own = f"{PARTIAL}{short_sha256(platform.node(), 8)}."

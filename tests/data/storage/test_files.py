@@ -52,6 +52,15 @@ def test_the_next_writer_deletes_what_a_killed_one_left(tmp_path: Path, there: b
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*others, "out"])
 
 
+def test_a_link_to_a_folder_stays_and_the_folder_is_replaced(tmp_path: Path) -> None:
+    left(tmp_path, "disk")
+    (tmp_path / "out").symlink_to("disk")
+    with new_folder(tmp_path / "out") as folder:
+        (folder / "file").write_text("new")
+    assert (tmp_path / "out").is_symlink() and (tmp_path / "disk" / "file").read_text() == "new"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["disk", "out"]
+
+
 def test_an_error_leaves_the_older_folder(tmp_path: Path) -> None:
     left(tmp_path, "out")
     with pytest.raises(KeyError), new_folder(tmp_path / "out") as folder:
