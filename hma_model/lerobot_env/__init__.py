@@ -99,11 +99,12 @@ class HMAEnvConfig(EnvConfig):
 
     def _read(self, checkpoint: Checkpoint) -> None:
         """Complete what the checkpoint says."""
-        if self.horizon < 1:
-            raise UsageError("horizon", f"is {self.horizon}", "give 1 or more")
+        robot = checkpoint.embodiment(self.embodiment)
+        if self.horizon < robot.stride:
+            remedy = f"give {robot.stride} or more, the actions of one frame"
+            raise UsageError("horizon", f"is {self.horizon}", remedy)
         if self.judge is not None:
             judged_task(self.embodiment, self.judge)
-        robot = checkpoint.embodiment(self.embodiment)
         self.fps = max(1, round(robot.rate_hz if robot.states_rate else 10))
         self.task = self.task or self.embodiment
         side = self.size or image_shape(checkpoint.config)[0]

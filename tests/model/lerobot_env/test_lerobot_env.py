@@ -132,7 +132,7 @@ def test_features_are_read_from_the_checkpoint() -> None:
         ({}, "embodiment: is not given — give --env.embodiment=ID; the model has: arm1_02"),
         ({"embodiment": "nobody"}, "embedded-fsq: has no embodiment 'nobody'"),
         ({"embodiment": ROBOT, "judge": "liked"}, "judge: 'liked' is not a task"),
-        ({"embodiment": ROBOT, "horizon": 0}, "horizon: is 0 — give 1 or more"),
+        ({"embodiment": ROBOT, "horizon": 4}, "horizon: is 4 — give 5 or more, the actions of one frame"),
     ],
 )
 def test_settings_that_are_wrong(given: dict[str, Any], said: str) -> None:
