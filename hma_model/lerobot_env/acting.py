@@ -6,10 +6,11 @@
 lerobot finds the policy and its processors in this module by their names. `--policy.path` does not work: it
 reads a config.json of lerobot's own form, and a checkpoint has one of ours.
 
-N environments, A action dims.
+N environments, S pixels a side, V views side by side, A action dims.
 """
 
 from dataclasses import dataclass
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -28,7 +29,7 @@ from hma_data.errors import UsageError
 from hma_model.lerobot_env import in_one_line, opened
 from hma_model.lerobot_env.vector import camera_names
 from hma_model.policies.acting import Acting
-from hma_model.worlds.images import Prompt
+from hma_model.worlds.images import Prompt, fitted_view
 from hma_model.worlds.world import load_world
 
 NO_TRAINING = "is trained by hma train with objectives={policy: 1.0}, and not by lerobot"
@@ -79,7 +80,8 @@ class WorldModelPolicy(PreTrainedPolicy):
                 config.checkpoint, [name], device=config.device or "cpu",
                 unmask_steps=config.unmask_steps, temperature=config.temperature,
             )  # fmt: skip
-            robot = checkpoint.embodiment(name)
+            robot, spec = checkpoint.embodiment(name), checkpoint.config.spec
+            self._fits = [partial(fitted_view, spec=spec, camera=robot.camera(one)) for one in self._cameras]
             self._stride = robot.stride
             taken = (config.output_features or {}).get("action")
             if taken is not None and tuple(taken.shape) != (robot.action_dim,):
@@ -124,7 +126,7 @@ class WorldModelPolicy(PreTrainedPolicy):
         raise UsageError(self._where, NO_TRAINING)
 
     def _images(self, batch: dict[str, Tensor]) -> np.ndarray[Any, Any]:
-        """Return the images (N, H, W, 3) uint8 of the model's cameras, side by side."""
+        """Return the images (N, S, V·S, 3) uint8 of the model's cameras, side by side."""
         keys = [f"observation.images.{name}" for name in self._cameras]
         if len(keys) == 1 and keys[0] not in batch:
             keys = ["observation.image"]
@@ -133,9 +135,9 @@ class WorldModelPolicy(PreTrainedPolicy):
             fault = f"needs {', '.join(missing)}; the images are {there}"
             with in_one_line():
                 raise UsageError(self._where, fault, "rename them with --rename_map")
-        views = torch.cat([batch[key] for key in keys], dim=3)
-        pixels = (views * 255).round().clamp(0, 255).to(torch.uint8)
-        return pixels.permute(0, 2, 3, 1).numpy(force=True)
+        views = [(batch[key] * 255).round().clamp(0, 255).to(torch.uint8) for key in keys]
+        pixels = [view.permute(0, 2, 3, 1).numpy(force=True) for view in views]
+        return np.concatenate([fit(view) for fit, view in zip(self._fits, pixels)], axis=2)
 
 
 def make_hma_pre_post_processors(

@@ -14,9 +14,11 @@ from hma_data.episodes.images import decode_image, resize
 from hma_data.episodes.sheets import cell_scale, first_of_grid
 from hma_data.errors import EpisodeError, HMAError, UsageError
 from hma_data.loading.views import Cameras
+from hma_data.registry.components import Camera
 from hma_data.registry.embodiment import Embodiment
 from hma_data.storage.kinds import misplaced
 from hma_data.storage.paths import StrPath, as_path
+from hma_data.tokenizers.base import TokenizerSpec
 from hma_model.checkpoint.folder import SAMPLE, Checkpoint
 from hma_model.config import HMAConfig
 
@@ -110,7 +112,14 @@ def fitted(images: NDArray[Any], config: HMAConfig, robot: Embodiment | None) ->
         raise HMAError("prompt", fault, f"give {config.views} views side by side, {shape[1]}×{shape[0]}")
     if robot is None:
         return resize(images, spec.image_size, resize_filter=spec.resize_filter)
-    camera, size = robot.primary_camera, images.shape[1:3]
+    return fitted_view(images, spec, robot.primary_camera)
+
+
+def fitted_view(images: Images, spec: TokenizerSpec, camera: Camera) -> Images:
+    """Return images (P, H, W, 3) of a camera as (P, S, S, 3); `fitted` says how."""
+    size = images.shape[1:3]
+    if size == (spec.image_size, spec.image_size):
+        return images
     x, y, width, height = camera.crop or (0, 0, size[1], size[0])
     stated = camera.size and camera.size[:: -1 if camera.rotate in (90, 270) else 1]
     if stated in (None, size) and y + height <= size[0] and x + width <= size[1]:

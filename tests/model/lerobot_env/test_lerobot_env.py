@@ -29,6 +29,7 @@ from hma_model.policies.acting import Acting
 from hma_model.policies.arenas import Scenes, TrueArena
 from hma_model.policies.base import begin, checked
 from hma_model.worlds.world import World
+from tests.data import cameras as three
 from tests.hub_server import Hub
 from tests.hub_state import REPO
 from tests.model.policies.test_lerobot_policy import CAMERA, saved
@@ -274,6 +275,18 @@ def test_chunks_asked_for_at_once_are_the_actions_given_one_by_one(run: Path) ->
     whole.predict_action_chunk(batch(seen))
     last = [policy.predict_action_chunk(batch(seen)) for policy in (one, whole)]
     assert torch.equal(*last)  # what was left of a chunk counts as carried out
+
+
+def test_it_sees_each_of_its_cameras_as_in_a_conversion(tmp_path: Path) -> None:
+    shards: Any = SimpleNamespace(spec=get_tokenizer("fsq-8").spec, embodiment=three.arm())
+    trained_on(["side", "wrist"], shards, tmp_path / "model", "policy")
+    policy = WorldModelPolicy(WorldModelConfig(checkpoint=str(tmp_path / "model"), device="cpu"))
+    side, wrist = np.full((1, 64, 96, 3), 50, np.uint8), np.full((1, 32, 32, 3), 90, np.uint8)
+    seen = batch(side, "observation.images.side") | batch(wrist, "observation.images.wrist")
+    shown = policy._images(seen)[0]
+    assert shown.shape[1] == 2 * shown.shape[0]
+    assert (shown[:, : len(shown)] == 50).all() and (shown[:, len(shown) :] == 90).all()
+    assert policy.select_action(seen).shape == (1, 2)
 
 
 def test_lerobot_finds_it_and_its_processors_by_its_name(run: Path) -> None:
