@@ -149,9 +149,8 @@ def cache_folder() -> Path:
 def new_folder(folder: Path) -> Iterator[Path]:
     """Yield an empty folder to fill; it gets the given name when the block ends without an error.
 
-    It replaces an older folder of that name; of a link, the folder that it points to. On an error the new
-    folder is deleted and the older one stays as it was. What a killed writer of that name left on this machine
-    is deleted too.
+    It replaces an older folder of that name, or that it links to. On an error the new one is deleted and the
+    older one stays as it was. What a killed writer of that name left on this machine is deleted too.
     """
     folder = folder.resolve()
     folder.parent.mkdir(parents=True, exist_ok=True)

@@ -29,7 +29,7 @@ from hma_data.storage.paths import StrPath, as_path
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.generation.commands import described
 from hma_model.generation.decode import trained_cameras
-from hma_model.worlds.images import fitted, recorded_cameras, seen_cameras
+from hma_model.worlds.images import fitted
 from hma_model.worlds.prompts import SeenShards
 from hma_model.worlds.world import World
 
@@ -177,8 +177,7 @@ def _video_episodes(
 ) -> list[FilmEpisode]:
     """Return an episode for each file; its frames are resized like those of the robot's camera."""
     robot = described(world.model, embodiment)
-    if robot is not None:
-        robot = _seen_by(robot, trained_cameras(world.model, embodiment))
+    cameras = trained_cameras(world.model, embodiment)
     found = []
     names = set[str]()
     for file in files:
@@ -189,12 +188,14 @@ def _video_episodes(
             content = file_sha256(file)
         except OSError as fault:  # it goes to quarantine when it is read
             content = str(fault)
-        read = partial(_encoded_video, world, file, robot, hz)
+        read = partial(_encoded_video, world, file, robot, cameras, hz)
         found.append(FilmEpisode(name, "", "", _key(name, content), read))
     return found
 
 
-def _encoded_video(world: World, file: Path, robot: Embodiment | None, hz: float) -> NDArray[Any]:
+def _encoded_video(
+    world: World, file: Path, robot: Embodiment | None, cameras: Cameras, hz: float
+) -> NDArray[Any]:
     """Return the frames of a video that are nearest to the ticks of a clock, as shards store them."""
     times = frame_table(file).times
     seconds = times[-1] - times[0]
@@ -205,14 +206,7 @@ def _encoded_video(world: World, file: Path, robot: Embodiment | None, hz: float
     video = VideoFile(file)
     stored = []
     for indices in batched(nearest.tolist(), DECODED):
-        images = fitted(video.frames(list(indices)), world.model.config, robot)
+        images = fitted(video.frames(list(indices)), world.model.config, robot, cameras)
         stored.append(world.tokenizer.encode(images))
     video.close()
     return np.concatenate(stored)
-
-
-def _seen_by(robot: Embodiment, cameras: Cameras) -> Embodiment:
-    """Return a robot whose primary camera is the one that a model of one view sees."""
-    camera, *_ = seen_cameras(cameras, recorded_cameras(robot))
-    sync = robot.sync.model_copy(update={"primary": None})
-    return robot.model_copy(update={"cameras": (robot.camera(camera),), "sync": sync})

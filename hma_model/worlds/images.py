@@ -13,7 +13,7 @@ from hma_data.arrays import Float32s, Images
 from hma_data.episodes.images import decode_image, resize
 from hma_data.episodes.sheets import cell_scale, first_of_grid
 from hma_data.errors import EpisodeError, HMAError, UsageError
-from hma_data.loading.views import Cameras
+from hma_data.loading.views import FIRST_CAMERA, Cameras
 from hma_data.registry.components import Camera
 from hma_data.registry.embodiment import Embodiment
 from hma_data.storage.kinds import misplaced
@@ -88,14 +88,17 @@ def recorded_cameras(robot: Embodiment) -> list[str]:
     return [primary, *(camera.name for camera in robot.cameras if camera.name != primary)]
 
 
-def fitted(images: NDArray[Any], config: HMAConfig, robot: Embodiment | None) -> Images:
+def fitted(
+    images: NDArray[Any], config: HMAConfig, robot: Embodiment | None, cameras: Cameras = FIRST_CAMERA
+) -> Images:
     """Return images (P, H, W, 3) uint8 as (P, S, V·S, 3), cropped and resized as in a conversion.
 
     They are upright and RGB already, so the camera's flip, rotation and colour order do not count. Its crop
     counts for images of the camera's size, or where that is not stated, for those that it fits in.
 
     Args:
-        robot: whose primary camera they are of; None crops them to squares.
+        robot: whose images they are; None crops them to squares.
+        cameras: that the model was trained on; they are of its camera if it sees only one.
 
     Raises:
         HMAError: they are no such images, or show several views in another size.
@@ -112,7 +115,7 @@ def fitted(images: NDArray[Any], config: HMAConfig, robot: Embodiment | None) ->
         raise HMAError("prompt", fault, f"give {config.views} views side by side, {shape[1]}×{shape[0]}")
     if robot is None:
         return resize(images, spec.image_size, resize_filter=spec.resize_filter)
-    return fitted_view(images, spec, robot.primary_camera)
+    return fitted_view(images, spec, robot.camera(seen_cameras(cameras, recorded_cameras(robot))[0]))
 
 
 def fitted_view(images: Images, spec: TokenizerSpec, camera: Camera) -> Images:

@@ -309,7 +309,7 @@ def drivable(
         if len({image.shape for image in begun}) > 1:
             raise UsageError("--prompt", "its images differ in size", "give images of one size")
         if begun:
-            shown = fitted(np.stack(begun), checkpoint.config, embodiment)
+            shown = fitted(np.stack(begun), checkpoint.config, embodiment, cameras)
             imaged = ImageRobot(embodiment, stats, shown, cameras)
             found[imaged.key] = imaged
     if not found:

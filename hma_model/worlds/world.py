@@ -27,7 +27,7 @@ from hma_data.tokenizers.base import Tokenizer, reopened
 from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.evaluation.calibration import Meter, meter_of
 from hma_model.generation.commands import Commands, card, described
-from hma_model.generation.decode import decode
+from hma_model.generation.decode import decode, trained_cameras
 from hma_model.generation.engine import products_in
 from hma_model.generation.rollout import Rollout
 from hma_model.generation.state import Snapshot as Snapshot
@@ -225,7 +225,8 @@ class World:
         """
         config = self.model.config
         if not len(frames) or frames.shape[1:] != config.frame_shape:
-            images = fitted(frames, config, described(self.model, embodiment))
+            cameras = trained_cameras(self.model, embodiment)
+            images = fitted(frames, config, described(self.model, embodiment), cameras)
             views = [self.tokenizer.encode(view) for view in np.split(images, config.views, axis=2)]
             frames = np.concatenate(views, axis=-2)
         if not config.discrete:

@@ -22,7 +22,7 @@ from hma_model.generation import commands as generation_commands
 from hma_model.simulate import World, read_prompt
 from hma_model.synthetic import film as film_module
 from hma_model.synthetic import labels
-from hma_model.synthetic.film import ShardFilm, _seen_by, read_film
+from hma_model.synthetic.film import ShardFilm, read_film
 from hma_model.synthetic.labels import explained_95, infer, label_actions
 from tests.conftest import BlockTokenizer
 from tests.data import cameras
@@ -309,11 +309,3 @@ def test_film_of_the_robot_without_the_models_camera_is_refused(three, views, tm
     convert(people, recording, BlockTokenizer(), tmp_path / "people")
     film = ShardFilm(world, ShardSet(tmp_path / "people"), three.row_stride, three.embodiment.id)
     assert film.cameras == ["top"]
-
-
-def test_videos_are_cut_as_the_camera_that_the_model_was_trained_on() -> None:
-    values = cameras.arm().to_dict()
-    values["cameras"][1] |= {"resize": "stretch"}
-    values["sync"] = {"primary": "top"}
-    robot = _seen_by(type(cameras.arm()).from_values(values, "arm"), "wrist")
-    assert robot.primary_camera.name == "wrist" and robot.primary_camera.resize == "stretch"

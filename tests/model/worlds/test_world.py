@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 
 from hma_data.episodes.images import resize
 from hma_data.errors import HMAError
+from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from hma_data.tokenizers.base import get_tokenizer
@@ -22,8 +24,9 @@ from hma_model.policies.arenas import Scenes, TrueArena
 from hma_model.policies.planning import Cost
 from hma_model.simulate import World, WorldModelEnv, load_world, starting_window
 from hma_model.synthetic.augment import Augmentation, augment
+from tests.data import cameras as three
 from tests.model.network.test_unet import COLORS, PIXELS
-from tests.model.true_world import _of_robot, family
+from tests.model.true_world import _of_robot, family, trained_on
 
 ARM, OTHER = "gantry_04", "rails_03"
 SURE: dict[str, Any] = {"unmask_steps": 1, "temperature": 0.0}  # draws nothing
@@ -134,6 +137,17 @@ def test_a_action_of_nan_is_unknown_and_not_zero(model: HMA, windows: dict[str, 
         expected = model.generate(stored, actions, OTHER, 1, known=masks, **SURE)
         assert np.array_equal(decode(world.tokenizer, expected)[0, 0], made[name])
     assert not np.array_equal(made["unknown"], made["zero"])
+
+
+def test_images_of_a_robot_are_cropped_as_those_of_the_camera_that_the_model_sees(tmp_path: Path) -> None:
+    values = three.arm().to_dict()
+    values["cameras"][-1] |= {"crop": [32, 0, 64, 64]}
+    tokenizer = get_tokenizer("fsq-8")
+    shards: Any = SimpleNamespace(spec=tokenizer.spec, embodiment=Embodiment.from_values(values, "an arm"))
+    world = World(trained_on("side", shards, tmp_path / "model").model, tokenizer)
+    images = np.random.default_rng(0).integers(0, 256, (1, 64, 96, 3), np.uint8)
+    wanted = tokenizer.encode(resize(images[:, :, 32:], tokenizer.spec.image_size))
+    assert np.array_equal(world.encoded("three_hdf5", images), wanted)
 
 
 def test_images_of_another_size_are_resized_as_in_a_conversion(model: HMA, windows: dict[str, Any]) -> None:
