@@ -184,6 +184,10 @@ class TokenReadout(nn.Module):
         ]
         return torch.stack(each).sum(0)
 
+    def thins(self, features: Tensor) -> bool:
+        """Check whether the loss of tokens is a matter of cost: colours, scored on a CPU."""
+        return self.distances is not None and has_kernel(self.linear, features)
+
     def _kernel_loss(self, features: Tensor, digits: Tensor, before: Tensor | None) -> Tensor:
         gains = None
         if self.copy is not None and before is not None:

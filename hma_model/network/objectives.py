@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from hma_data.loading.rows import Batch
 
 ACTION_LOSS_WEIGHT = 0.5  # relative to the video loss
+FLAT = 16  # see _weights
 
 
 @dataclass
@@ -300,17 +301,23 @@ def _video_loss(
     `before` (B, T, S, F or C), sorted by embodiment as the features, are the digits of the frames before, or
     their patches if what moves weighs more.
     """
-    masked = groups.sort(masked)
+    masked, frames = groups.sort(masked), groups.sort(frames)
+    counts, weights = masked.flatten(1).sum(1), None
+    thins = model.training and model.config.discrete and model.token_readout.thins(features)
+    if thins and before is not None:
+        weights = _weights(model.config, frames, before, generator)
+        masked = masked & (weights > 0)
     rows = masked.flatten().nonzero().squeeze(1)  # on the generator's device, so no wait for an accelerator
     sample = (rows // masked[0].numel()).to(features.device)
     rows = rows.to(features.device)
     whole = len(rows) == masked.numel()  # then nothing is picked out, which would cost as much as a block
-    chosen, targets, near = (
-        values if values is None or whole else values[rows]
+    chosen, targets, near, weights = (
+        values if values is None or whole else values.index_select(0, rows)
         for values in (
             features.flatten(0, 2),
-            groups.sort(frames).flatten(0, 2),
+            frames.flatten(0, 2),
             None if before is None else before.flatten(0, 2),
+            None if weights is None else weights.flatten(),
         )
     )
     assert chosen is not None and targets is not None
@@ -318,7 +325,22 @@ def _video_loss(
         losses = model.token_readout.loss(chosen, to_digits(targets, model.config.digits), near)
     else:
         losses = model.latent_readout.loss(targets, chosen, generator, near)
-    return losses.sum() / max(len(rows), 1), groups.unsort(_means(losses, sample, len(frames)))
+    losses = losses if weights is None else losses * weights
+    return losses.sum() / max(int(counts.sum()), 1), groups.unsort(_means(losses, sample, counts))
+
+
+def _weights(config: HMAConfig, frames: Tensor, before: Tensor, generator: torch.Generator | None) -> Tensor:
+    """Draw what the losses of tokens (B, T, S) weigh; those of weight 0 need not be computed.
+
+    Most of a simulator's frame is as in the frame before. Far from what changes, the loss of a token is
+    nearly zero, and costs as much as another: one of FLAT such tokens is drawn, and weighs FLAT times as
+    much, so that the expected loss is the same.
+    """
+    changes = (to_digits(frames, config.digits) != before).any(-1)
+    side = config.token_grid[1] if frames.shape[2] == config.tokens_per_frame else config.crop
+    near = F.max_pool2d(changes.float().unflatten(2, (-1, side)).flatten(0, 1), 3, 1, 1).view_as(changes) > 0
+    drawn = uniform(frames.shape, generator, frames.device) < 1 / FLAT
+    return torch.where(near, 1.0, FLAT * drawn)
 
 
 def _action_loss(
@@ -347,11 +369,12 @@ def _action_loss(
         losses.append(model.head(name).loss(pooled[span][sample, frame], target, readout, generator))
         samples.append(sample + span.start)
     flat = torch.cat(losses)
-    return flat.sum() / max(len(flat), 1), groups.unsort(_means(flat, torch.cat(samples), len(chunks)))
+    sample = torch.cat(samples)
+    counts = sample.bincount(minlength=len(chunks))
+    return flat.sum() / max(len(flat), 1), groups.unsort(_means(flat, sample, counts))
 
 
-def _means(losses: Tensor, sample: Tensor, batch: int) -> Tensor:
-    """Return each sample's mean (B,) of losses (M,); 0 for a sample without any."""
-    zeros = losses.new_zeros(batch)
-    count = zeros.index_add(0, sample, torch.ones_like(losses))
-    return zeros.index_add(0, sample, losses.detach()) / count.clamp(min=1)
+def _means(losses: Tensor, sample: Tensor, counts: Tensor) -> Tensor:
+    """Return each sample's mean (B,) of losses (M,), of which it has `counts` (B,); 0 for one without any."""
+    counts = counts.to(losses.device).clamp(min=1)
+    return losses.new_zeros(len(counts)).index_add(0, sample, losses.detach()) / counts

@@ -13,6 +13,7 @@ from hma_data.errors import HMAError, RecipeError, TokenizerError
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_model import HMA
 from hma_model.config import HMAConfig
+from hma_model.network import objectives
 from hma_model.network.colors import SURE, balanced
 from hma_model.network.objectives import surrounded
 from hma_model.network.trunks.contract import Conditioning, TimePositions, paired_times
@@ -204,6 +205,36 @@ def test_a_graph_of_fixed_sizes_takes_the_same_colours(monkeypatch) -> None:
 def test_colours_that_are_not_those_of_the_tokens_are_refused() -> None:
     with pytest.raises(TokenizerError, match="has 2 colours, but digits of 5 values"):
         unet(**{**COLORS, "tokenizer": {"colors": "ffffff000000"}})
+
+
+def test_of_tokens_that_stay_as_they_were_a_few_stand_for_all(monkeypatch) -> None:
+    model = unet(**{**COLORS, "grid": (16, 16), "tokenizer": {"colors": SHADES}}).train()
+    batch = small_batch(model.config, ["arm", "hand.v1"])
+    batch.tokens = stored(model, 2, 1).expand(2, model.config.frames, -1, -1).clone()
+    batch.tokens[:, 2:, 3, 4] = (batch.tokens[:, 2:, 3, 4] + 1) % model.config.vocab_size
+    scored: list[int] = []
+    loss = model.token_readout.loss
+    monkeypatch.setattr(
+        model.token_readout, "loss", lambda *given: (scored.append(len(given[0])), loss(*given))[1]
+    )
+
+    def passed(seed: int) -> tuple[Tensor, Tensor, Tensor]:
+        model.zero_grad()
+        output = model(batch, generator=torch.Generator().manual_seed(seed))
+        output.loss.backward()
+        assert model.token_readout.linear.bias.grad is not None
+        return output.loss.detach(), output.per_sample, model.token_readout.linear.bias.grad.clone()
+
+    drawn = [torch.stack(values) for values in zip(*map(passed, range(300)), strict=True)]
+    assert max(scored) < 0.2 * 2 * 3 * 256
+    monkeypatch.setattr(objectives, "FLAT", 1)
+    every = passed(0)
+    assert scored[-1] == 2 * 3 * 256
+    for values, whole in zip(drawn, every, strict=True):
+        error = values.std(0) / 300**0.5
+        assert ((values.mean(0) - whole).abs() < 5 * error + 1e-6).all() and (
+            error < 0.1 * whole.abs().max()
+        ).all()
 
 
 CROP: dict[str, Any] = {"levels": (8,), "crop": 5}
