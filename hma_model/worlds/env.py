@@ -112,8 +112,9 @@ class WorldModelEnv(gymnasium.Env[Images, Float32s]):
             raise UsageError("embodiment", "is not given", f"give embodiment=ID; the model has: {there}")
         if control not in CONTROLS:
             raise UsageError("control", f"{control!r} is unknown", f"give {' or '.join(CONTROLS)}")
-        if size is not None and (not isinstance(size, int | np.integer) or size < 1):
-            raise UsageError("size", f"is {size}", "give a whole number of pixels, or leave it out")
+        for name, value, unit in (("size", size, "of pixels"), ("horizon", horizon, "of steps")):
+            if value is not None and (not isinstance(value, int | np.integer) or value < 1):
+                raise UsageError(name, f"is {value!r}", f"give a whole number {unit}, 1 or more, or None")
         if size is not None and world.image_shape[0] != world.image_shape[1]:
             raise UsageError("size", "is for models of one view", "leave it out")
         self.world = world
@@ -280,6 +281,8 @@ class WorldModelVectorEnv(SyncVectorEnv):
 
     def dream(self, chosen: Ints, actions: Any) -> None:
         """Make the images of the next step of some environments in one pass, under actions (N, …)."""
+        if len(actions) != self.num_envs:
+            raise HMAError("step", f"has {len(actions)} actions", f"give {self.num_envs}, one per environment")
         checked = [self.envs[i].checked(actions[i]) for i in chosen]  # all, before any is queued
         chunks = [self.envs[i].queue(values) for i, values in zip(chosen, checked, strict=True)]
         made = self.world.step({session: chunk for part in chunks for session, chunk in part.items()})

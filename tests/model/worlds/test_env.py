@@ -233,6 +233,9 @@ def test_an_action_that_is_refused_leaves_no_environment_of_a_vector_ahead(how: 
     bad[1] = np.inf
     with pytest.raises(HMAError, match="not finite"):
         envs.step(bad)
+    for count in (1, 3):
+        with pytest.raises(HMAError, match=f"has {count} actions — give 2, one per environment"):
+            envs.step(np.resize(given[1], (count, *given[1].shape[1:])))
     frames = [envs.step(action)[4]["frames"].tolist() for action in given[1:]]
     assert frames == [[1, 1], [1, 1], [2, 2]]  # both get their image after two actions
 
@@ -245,6 +248,8 @@ def test_an_action_that_is_refused_leaves_no_environment_of_a_vector_ahead(how: 
         ({"control": "second"}, "'second' is unknown — give frame or chunk"),
         ({"size": 0}, "size: is 0 — give a whole number of pixels"),
         ({"size": 64.5}, "size: is 64.5 — give a whole number of pixels"),
+        ({"horizon": 0}, "horizon: is 0 — give a whole number of steps"),
+        ({"horizon": "3"}, "horizon: is '3' — give a whole number of steps"),
     ],
 )
 def test_bad_settings_are_refused(world: World, change: dict[str, Any], message: str) -> None:
