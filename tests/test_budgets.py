@@ -36,16 +36,16 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/generation": (1_632, 13_122, 9),
     "hma_model/hub": (1_058, 8_091, 6),
     "hma_model/lerobot_env": (628, 4_854, 3),
-    "hma_model/network": (3_447, 29_947, 19),
+    "hma_model/network": (3_474, 30_262, 19),
     "hma_model/play": (1_607, 11_842, 8),
     "hma_model/policies": (2_855, 20_420, 14),
     "hma_model/released": (807, 6_817, 4),
     "hma_model/synthetic": (1_207, 9_282, 5),
     "hma_model/training": (3_682, 30_266, 20),
-    "hma_model/worlds": (1_491, 11_145, 6),
+    "hma_model/worlds": (1_495, 11_213, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_529, 516_116
-TEST_LINES = 48_529
+PRODUCT_LINES, PRODUCT_NODES = 65_560, 516_499
+TEST_LINES = 48_565
 DOC_WORDS = 41_999
 
 

@@ -282,7 +282,8 @@ class WorldModelVectorEnv(SyncVectorEnv):
     def dream(self, chosen: Ints, actions: Any) -> None:
         """Make the images of the next step of some environments in one pass, under actions (N, …)."""
         if len(actions) != self.num_envs:
-            raise HMAError("step", f"has {len(actions)} actions", f"give {self.num_envs}, one per environment")
+            fault = f"has {len(actions)} actions"
+            raise HMAError("step", fault, f"give {self.num_envs}, one per environment")
         checked = [self.envs[i].checked(actions[i]) for i in chosen]  # all, before any is queued
         chunks = [self.envs[i].queue(values) for i, values in zip(chosen, checked, strict=True)]
         made = self.world.step({session: chunk for part in chunks for session, chunk in part.items()})
