@@ -386,7 +386,9 @@ class Run:
                 base=self.start.checkpoint if self.start and self.start.frozen else None,
                 samples={name: sheets[name].read_bytes() for name in self.sets if name in sheets},
             )
-            for old in training_checkpoints(self.out)[: -self.recipe.keep_last]:
+            there = training_checkpoints(self.out)
+            behind = there.index(path) + 1  # those ahead could not be read, or the run would be there
+            for old in (*there[behind:], *there[: max(0, behind - self.recipe.keep_last)]):
                 checkpoints.remove(old)
             return path
 

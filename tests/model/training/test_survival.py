@@ -21,6 +21,7 @@ from hma_model.training.logging import read_metrics
 from hma_model.training.loop import train
 from hma_model.training.parallel import Ranks
 from hma_model.training.recipe import make_recipe
+from hma_model.training.run import Run
 from tests.model.processes import errors
 from tests.model.robots import SPEC
 from tests.model.runs import TINY, same, train_until
@@ -250,6 +251,22 @@ def test_a_flipped_bit_is_found_wherever_it_is(averaged, tmp_path, capsys, name,
     path.write_bytes(content)
     assert same(whole / "checkpoints/step-00000006", train(averaged(), out=run).checkpoint)
     assert f"skipped a damaged checkpoint: {run}/checkpoints/step-00000006" in capsys.readouterr().err
+
+
+def test_new_checkpoints_stay_though_a_damaged_one_is_ahead_of_them(averaged, tmp_path, monkeypatch, whole):
+    run = shutil.copytree(whole, tmp_path / "run")
+    (run / "checkpoints/step-00000006/trunk.safetensors").write_bytes(b"damaged")
+    kept, save = [], Run.save
+
+    def saved(self):
+        path = save(self)
+        kept.append([path.name, *(one.name for one in training_checkpoints(run))])
+        return path
+
+    monkeypatch.setattr(Run, "save", saved)
+    train(averaged(checkpoint_every=1, keep_last=1), out=run)
+    assert kept == [[f"step-0000000{step}"] * 2 for step in range(int(kept[0][0][-1]), 7)]
+    assert len(kept) > 1
 
 
 @pytest.mark.parametrize(
