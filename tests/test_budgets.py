@@ -41,12 +41,12 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/policies": (2_855, 20_420, 14),
     "hma_model/released": (807, 6_817, 4),
     "hma_model/synthetic": (1_207, 9_282, 5),
-    "hma_model/training": (3_682, 30_266, 20),
+    "hma_model/training": (3_684, 30_303, 20),
     "hma_model/worlds": (1_495, 11_213, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_560, 516_499
-TEST_LINES = 48_565
-DOC_WORDS = 41_999
+PRODUCT_LINES, PRODUCT_NODES = 65_562, 516_536
+TEST_LINES = 48_582
+DOC_WORDS = 41_997
 
 
 @cache
