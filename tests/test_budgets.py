@@ -45,7 +45,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/worlds": (1_495, 11_213, 6),
 }
 PRODUCT_LINES, PRODUCT_NODES = 65_562, 516_536
-TEST_LINES = 48_582
+TEST_LINES = 48_586
 DOC_WORDS = 41_997
 
 

@@ -134,6 +134,8 @@ def test_an_extension_is_that_of_plain_loops(base: Path, data: st.DataObject, re
     marks = {ref.id: "old" if state == "c" else ref.fingerprint for ref, state in zip(refs, states)}
     known = [*ids["k"], *ids["c"], "gone"]
     columns = {"id": known, "fingerprint": [marks.get(name, "") for name in known], "content": known}
+    groups = {ref.id: ref.group for ref in refs}
+    columns |= {"group": [groups.get(name, "") for name in known], "split": ["val"] * len(known)}
     there = SimpleNamespace(episodes=pa.table(columns), refused=[Refused(name, "E", "") for name in ids["r"]])
     plan = make_plan(refs, ARM, BlockTokenizer.spec, Settings(), "toy")
     manifest = SimpleNamespace(
@@ -155,6 +157,8 @@ def test_an_extension_is_that_of_plain_loops(base: Path, data: st.DataObject, re
         made = extend.extended(base, manifest, plan, 100, content)  # type: ignore[arg-type]
     assert asked == ids["c"]
     splits = {ref.id: unit.split for unit in plan.units for _, ref in unit.episodes}
+    parts = {groups[name] for name in known if groups.get(name)}  # of recordings that the set has begun
+    splits |= {ref.id: "val" for ref in refs if ref.group in parts}
     new = [replace(ref, split=splits[ref.id]) for ref in refs if ref.id in ids["n"]]
     placed = [(len(known) + len(ids["r"]) + i, ref, splits[ref.id]) for i, ref in enumerate(new)]
     cut = cut_by_hand(placed, 100, {"train": 2, "val": 1})
