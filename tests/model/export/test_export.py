@@ -94,7 +94,7 @@ def test_every_bundled_robot_makes_the_tokens_of_torch(name: str, tmp_path: Path
     assert manifest["weights"] == "float16" and manifest["step"]["bytes"] < 15e6
     for robot in checkpoint.embodiments:
         # Two scores may be alike up to rounding, so frames that follow from one another may part.
-        made = closed_loop(tmp_path / "page", checkpoint, robot, count=60, led=True)
+        made = closed_loop(tmp_path / "page", checkpoint, robot, count=30, led=True)
         assert np.mean([np.array_equal(own, theirs) for own, theirs, _ in made]) > 0.9, robot
         assert np.mean([own != theirs for own, theirs, _ in made]) < 1e-4, robot
 
