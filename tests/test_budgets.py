@@ -13,7 +13,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules stand under its name alone
-    "hma_data": (744, 4_321, 8),
+    "hma_data": (766, 4_346, 8),
     "hma_data/cli": (1_549, 11_018, 8),
     "hma_data/conversion": (4_103, 30_408, 15),
     "hma_data/episodes": (1_811, 15_803, 9),
@@ -26,7 +26,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/sources": (12_476, 102_450, 51),
     "hma_data/storage": (1_697, 11_105, 11),
     "hma_data/tokenizers": (3_459, 25_242, 18),
-    "hma_model": (564, 3_409, 4),
+    "hma_model": (570, 3_424, 4),
     "hma_model/benchmark": (857, 7_235, 5),
     "hma_model/checkpoint": (949, 7_299, 5),
     "hma_model/cli": (1_762, 11_439, 12),
@@ -44,9 +44,9 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_684, 30_303, 20),
     "hma_model/worlds": (1_495, 11_213, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_562, 516_536
+PRODUCT_LINES, PRODUCT_NODES = 65_590, 516_576
 TEST_LINES = 48_586
-DOC_WORDS = 41_997
+DOC_WORDS = 41_996
 
 
 @cache
