@@ -8,6 +8,7 @@ N rows of a shard, A values of an action.
 """
 
 from collections.abc import Callable, Iterator
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -132,17 +133,24 @@ def _footer_problems(
     own, hashed = manifest.plan, footer.plan.get("hash")
     if footer.plan != own and hashed not in own.get("extends", ()):
         return [f"was made by another plan ({hashed}) than the manifest's ({own['hash']})"]
-    found: list[str] = []
-    if (footer.name, footer.split) != (shard.path, shard.split):
-        found.append(f"its footer calls it {footer.name} of split {footer.split}")
-    if tuple(row_groups) != shard.row_groups or sum(row_groups) != shard.rows:
-        found.append(f"its row groups of {row_groups} rows are not those of the manifest")
-    if len(footer.episodes) != shard.episodes:
-        found.append(f"holds {len(footer.episodes)} episodes, the manifest says {shard.episodes}")
-    named = {(row.shard, row.split) for row in footer.episodes}
-    if named - {(footer.name, footer.split)}:
+    found = []
+    stated = replace(
+        shard,
+        path=footer.name,
+        split=footer.split,
+        rows=sum(row_groups),
+        episodes=len(footer.episodes),
+        row_groups=tuple(row_groups),
+    )
+    if stated != shard:
+        facts = asdict(stated).items() - asdict(shard).items()
+        said = ", ".join(f"{name} {value}" for name, value in sorted(facts))
+        found.append(f"states other facts than the manifest: {said}")
+    table = footer.table
+    named = table.group_by(["shard", "split"]).aggregate([]).to_pylist()
+    if named not in ([], [{"shard": footer.name, "split": footer.split}]):
         found.append("its episodes name another shard or split")
-    begun, rows, length = (to_numpy(footer.table[name]) for name in ("row_start", "rows", "length"))
+    begun, rows, length = (to_numpy(table[name]) for name in ("row_start", "rows", "length"))
     starts = np.cumsum([0, *rows])
     if (begun != starts[:-1]).any() or starts[-1] != shard.rows:
         found.append("its episodes do not follow one another row by row")
@@ -150,10 +158,9 @@ def _footer_problems(
         found.append("an episode does not have one row for each frame")
     expected, actual = manifest.layout.schema, pq.read_schema(parquet_input(path))
     if not actual.equals(expected, check_metadata=False):
-        wrong = [f"{column.name} {column.type}" for column in actual if column not in list(expected)]
-        missing = [f"{column.name} {column.type}" for column in expected if column not in list(actual)]
-        said = f"has {', '.join(wrong) or 'no others'}; missing {', '.join(missing) or 'none'}"
-        found.append(f"its columns are not those of the manifest's embodiment and tokenizer: {said}")
+        others = [f"{column.name} {column.type}" for column in {*actual} ^ {*expected}]
+        said = "its columns are not those of the manifest's embodiment and tokenizer"
+        found.append(f"{said}; different: {', '.join(sorted(others)) or 'their order'}")
     return found
 
 
@@ -188,12 +195,11 @@ def _read_rows(path: Path, manifest: Manifest) -> tuple[dict[str, Array], list[s
 def _row_problems(columns: dict[str, Array], footer: Footer) -> list[str]:
     """Check rows against the footer: whole episodes, frames that count up, zeros where nothing is known."""
     found: list[str] = []
-    length = to_numpy(footer.table["length"])
-    episodes = np.repeat(to_numpy(footer.table["episode_index"]), length)
-    counting = [np.arange(n) for n in length] or [np.zeros(0)]
-    if not np.array_equal(columns["episode_index"], episodes):
+    start, length, number = (to_numpy(footer.table[name]) for name in ("row_start", "length", "episode_index"))
+    frames = np.arange(length.sum()) - np.repeat(start, length)
+    if not np.array_equal(columns["episode_index"], np.repeat(number, length)):
         found.append("column episode_index is not what its footer says")
-    if not np.array_equal(columns["frame_index"], np.concatenate(counting)):
+    if not np.array_equal(columns["frame_index"], frames):
         found.append("column frame_index does not count up from 0 in every episode")
     if (np.diff(columns["timestamp"])[np.diff(columns["frame_index"]) > 0] < 0).any():
         found.append("timestamps go back within an episode")
@@ -220,8 +226,7 @@ def _stats_problems(columns: dict[str, Array], footer: Footer, manifest: Manifes
         if said is None or len(said.mean) != len(own.mean):
             found.append(f"its footer has no statistics of {name}")
         elif stride > 1:
-            known = columns.get(f"{name}_known", np.ones(0, np.bool_))
-            masked = int((~known).sum())
+            masked = np.count_nonzero(~columns.get(f"{name}_known", np.ones(0, np.bool_)))
             if not own.count <= said.count <= stride * (own.count + len(footer.episodes) + masked):
                 counted = f"count {said.count} steps, its rows {own.count}"
                 found.append(f"{name} statistics in its footer {counted}")
@@ -277,9 +282,9 @@ def _foreign(folder: Path, manifest: Manifest) -> Iterator[str]:
     known |= {MANIFEST, EPISODES, QUARANTINE, EMBODIMENT}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
-        if name in known or name.startswith(WORKING) or (path.is_dir() and name in SPLITS):
+        if name in known or name.startswith(WORKING) or path.name == FINDER:
             continue
-        if path.name == FINDER:
+        if name in SPLITS and path.is_dir():
             continue
         if path.name.endswith(PART):
             yield f"{path}: is left of a job that runs or was killed — run the same hma convert again"
@@ -294,16 +299,10 @@ def _set_problems(folder: Path, manifest: Manifest, derived: Derived, restat: st
         yield f"{folder / EPISODES}: differs from the shards' footers — {restat}"
     if (folder / QUARANTINE).read_bytes() != derived.quarantine.encode():
         yield f"{folder / QUARANTINE}: differs from the shards' footers — {restat}"
-    where, own = folder / MANIFEST, derived.manifest
-    for split, counts in own.splits.items():
-        if manifest.splits.get(split) != counts:
-            yield f"{where}: its counts of split {split} are not those of the shards — {restat}"
-    if manifest.quarantined != own.quarantined:
-        counted = f"says {manifest.quarantined} are in quarantine, the shards say {own.quarantined}"
-        yield f"{where}: {counted} — {restat}"
-    for name in own.stats.keys() | manifest.stats.keys():
-        if manifest.stats.get(name) != own.stats.get(name):
-            yield f"{where}: its statistics of {name} are not those of the train shards — {restat}"
+    own = derived.manifest
+    for name in ("splits", "quarantined", "stats"):
+        if getattr(manifest, name) != getattr(own, name):
+            yield f"{folder / MANIFEST}: its {name} are not those of the shards — {restat}"
 
 
 def _episode_problems(folder: Path, episodes: pa.Table) -> Iterator[str]:

@@ -172,11 +172,11 @@ def reseal(folder: Path, change) -> None:
 
 
 CHANGES = {
-    "counts of split train": lambda m: m["splits"]["train"].update(episodes=3),
-    "in quarantine": lambda m: m["totals"].update(quarantined=2),
-    "statistics of action": lambda m: m["stats"]["action"]["mean"].__setitem__(0, 0.123),
+    "splits": lambda m: m["splits"]["train"].update(episodes=3),
+    "quarantined": lambda m: m["totals"].update(quarantined=2),
+    "stats": lambda m: m["stats"]["action"]["mean"].__setitem__(0, 0.123),
     "plan's hash": lambda m: m["plan"].update(recording="0123456789abcdef"),
-    "row groups": lambda m: m["shards"][0].update(row_groups=[1, 2]),
+    "row_groups": lambda m: m["shards"][0].update(row_groups=[1, 2]),
     "another tokenizer": lambda m: m["tokenizer"].update(version=2),
     "another embodiment": lambda m: m["embodiment"].update(target_hz=1.0),
 }
