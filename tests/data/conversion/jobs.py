@@ -20,16 +20,13 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.hdf5.source import Hdf5Source
 from tests.conftest import ARM_YAML, BlockTokenizer
 
-source, out, trouble, workers, seed, quiet_s = sys.argv[1:]
+source, out, trouble, workers, seed = sys.argv[1:]
 read = Hdf5Source.read
 def troubled(self, uri, episode_id, embodiment):
     time.sleep(0.02)
     said = Path(trouble) / episode_id
     if said.exists():
-        kind = said.read_text()
-        if kind == "hang":
-            time.sleep(600)
-        os.kill(os.getpid(), getattr(signal, kind))
+        os.kill(os.getpid(), getattr(signal, said.read_text()))
     return read(self, uri, episode_id, embodiment)
 Hdf5Source.read = troubled
 worker.get_tokenizer = job.get_tokenizer = lambda *a, **k: BlockTokenizer()
@@ -38,7 +35,7 @@ if __name__ == "__main__":
     job.convert(
         Embodiment.from_yaml(ARM_YAML), source, "block", out, workers=int(workers), max_quarantine=1,
         settings=Settings(val_fraction=0.2, shard_frames=60, seed=int(seed)),
-        limits=Limits(quiet_s=float(quiet_s), kills=50),
+        limits=Limits(quiet_s=120, kills=50),
     )
 """
 
@@ -50,20 +47,19 @@ def start(
     *,
     workers: int = 2,
     seed: int = 0,
-    quiet_s: float = 120,
     **trouble: str,
 ) -> subprocess.Popen[str]:
     """Start a conversion as `convert_toy` makes it.
 
     Args:
         folder: for its script and its troubles.
-        trouble: episode -> what its reader does: "hang", or the name of a signal that ends the process.
+        trouble: episode -> the signal that ends the process of its reader.
     """
     (folder / "trouble").mkdir(exist_ok=True)
     for episode, kind in trouble.items():
         (folder / "trouble" / episode).write_text(kind)
     (folder / "job.py").write_text(SCRIPT)
-    words = [folder / "job.py", recording, out, folder / "trouble", workers, seed, quiet_s]
+    words = [folder / "job.py", recording, out, folder / "trouble", workers, seed]
     return subprocess.Popen(
         [sys.executable, *map(str, words)],
         env={**os.environ, "PYTHONPATH": str(ROOT)},

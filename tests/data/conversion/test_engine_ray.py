@@ -69,24 +69,6 @@ def test_a_process_that_is_killed_costs_nothing(cluster, tmp_path: Path) -> None
 
 
 @on_a_cluster
-def test_an_actor_that_is_killed_costs_nothing(cluster, tmp_path: Path) -> None:
-    def lose() -> None:
-        note = tmp_path / "long-0"
-        while not (note.exists() and note.read_text()):
-            time.sleep(0.05)
-        os.kill(int(note.read_text()), signal.SIGKILL)
-
-    thread = threading.Thread(target=lose, daemon=True)
-    thread.start()
-    patient = Limits(quiet_s=200, kills=4)  # only the kill may end the first attempt
-    results, events = do([Unit("long", ("a",), "a", "hang", times=1), PLAIN[0]], tmp_path, limits=patient)
-    thread.join(60)
-    assert results == {"long": ["a"], "u0": ["a", "b"]}
-    reasons = [event.reason for _, event in events if isinstance(event, Retry)]
-    assert any(reason.startswith("was lost: ") for reason in reasons)
-
-
-@on_a_cluster
 def test_an_actor_that_is_killed_between_two_units_costs_nothing(cluster, tmp_path: Path) -> None:
     from hma_data.conversion.engines.ray import run
 
@@ -102,13 +84,12 @@ def test_an_actor_that_is_killed_between_two_units_costs_nothing(cluster, tmp_pa
 
 
 @on_a_cluster
-@pytest.mark.parametrize(("wanted", "said"), [({"gpus": 1}, r"1 GPU \(of 0\)"), ({"cpus": 500}, "500 CPU")])
-def test_a_worker_that_no_node_of_this_machine_can_hold_is_one_error(cluster, monkeypatch, wanted, said):
+def test_a_worker_that_no_node_of_this_machine_can_hold_is_one_error(cluster, monkeypatch) -> None:
     from hma_data.conversion.engines import ray as engine
 
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    with pytest.raises(HMAError, match=f"has no room for a worker.*{said}"):
-        list(engine.run(PLAIN, Unreadable(), 1, lambda number, event: None, LIMITS, **wanted))
+    with pytest.raises(HMAError, match=r"has no room for a worker.*500 CPU \(of 2\) and 1 GPU \(of 0\)"):
+        list(engine.run(PLAIN, Unreadable(), 1, lambda number, event: None, LIMITS, cpus=500, gpus=1))
 
 
 @on_a_cluster
@@ -179,12 +160,6 @@ def test_a_node_that_is_lost_takes_no_unit_along(cluster, tmp_path: Path) -> Non
 def whole(toy_arm, toy_recording, tmp_path: Path) -> dict[str, bytes]:
     convert(toy_arm, str(toy_recording), "raw", tmp_path / "whole", settings=SETTINGS)
     return contents(tmp_path / "whole")
-
-
-@on_a_cluster
-def test_the_bytes_are_those_of_the_local_engine(cluster, toy_arm, toy_recording, tmp_path, whole) -> None:
-    convert(toy_arm, str(toy_recording), "raw", tmp_path / "out", settings=SETTINGS, workers=2, engine="ray")
-    assert contents(tmp_path / "out") == whole
 
 
 DRIVER = """
@@ -281,15 +256,12 @@ def test_a_cluster_that_does_not_answer_is_one_error(address, said, monkeypatch,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("stated", "seen"), [(None, "False"), ("1", "True")])
-def test_actors_take_their_nodes_environment_unless_the_user_says_otherwise(stated, seen, monkeypatch):
+def test_actors_take_the_environment_of_their_node(monkeypatch) -> None:
     monkeypatch.delenv(UV_ENVIRONMENT, raising=False)
-    if stated:
-        monkeypatch.setenv(UV_ENVIRONMENT, stated)
     program = "from hma_data.conversion.engines.ray import *; ray = import_ray()\n"
     program += f"print(ray._private.ray_constants.{UV_ENVIRONMENT})"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT)
-    assert done.stdout.strip() == seen, done.stderr
+    assert done.stdout.strip() == "False", done.stderr
 
 
 def test_without_ray_the_error_says_how_to_install_it(tmp_path, monkeypatch) -> None:

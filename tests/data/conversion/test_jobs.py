@@ -22,7 +22,7 @@ from hma_data.conversion import worker as shard_work
 from hma_data.conversion.job import Conversion, convert
 from hma_data.conversion.output import PLAN, Share
 from hma_data.conversion.report import Summary
-from hma_data.errors import HMAError, OutputError
+from hma_data.errors import OutputError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.manifest import Manifest, shard_sizes
 from hma_data.shards.verify import verify
@@ -62,13 +62,6 @@ def test_only_who_tokenizes_opens_the_tokenizer(
 
 
 @pytest.mark.slow
-def test_a_device_that_workers_lack_is_one_error(toy_arm, toy_recording, tmp_path) -> None:
-    with pytest.raises(HMAError, match="cannot run on device 'no such'"):
-        convert(toy_arm, toy_recording, "fsq-8", tmp_path / "out", device="no such", workers=1)
-    assert not contents(tmp_path / "out")
-
-
-@pytest.mark.slow
 def test_workers_without_a_shard_are_told_before_the_work_and_by_a_dry_run(toy_arm, tmp_path) -> None:
     (tmp_path / "toy_arm.yaml").write_text(toy_arm.to_yaml())
     write_toy(tmp_path / "toy.hdf5", [20] * 8)
@@ -77,16 +70,10 @@ def test_workers_without_a_shard_are_told_before_the_work_and_by_a_dry_run(toy_a
     line = "2 of 3 workers have work; --shard-frames 20 gives more"
     planned = hma(*words, "--dry-run")
     assert planned.stdout.splitlines()[-1] == line
-    shared = [*words, "--shard-index", "2", "--shard-count", "4"]
     empty = "0 of 3 workers have work; --shard-frames 20 in every task gives more"
-    planned = hma(*shared, "--dry-run")
-    assert planned.stdout.splitlines()[-1] == empty
-    assert "with --workers 3 in each of 4 tasks" in planned.stdout
-    assert empty in hma(*shared).stderr.splitlines()
+    shared = hma(*words, "--shard-index", "2", "--shard-count", "4", "--dry-run").stdout
+    assert shared.splitlines()[-1] == empty and "with --workers 3 in each of 4 tasks" in shared
     assert line in hma(*words).stderr.splitlines()
-    assert "workers have work" not in hma(*words).stderr  # all shards are there
-    (tmp_path / "out/val/shard-00000.parquet").unlink()
-    assert "1 of 3 workers have work" in hma(*words).stderr.splitlines()
 
 
 UNGUARDED = """
@@ -95,26 +82,22 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.storage.paths import as_path
 print("imported", flush=True)
 robot = Embodiment.from_yaml(as_path("toy_arm.yaml").read_text())
+convert(robot, "toy.hdf5", "fsq-8", "out", workers=2)
 """
-CALL = 'print(convert(robot, "toy.hdf5", "fsq-8", "out", workers=2).made_shards)\n'
 
 
 @pytest.mark.slow
 def test_a_script_that_every_worker_would_run_is_told_to_guard_its_call(toy_arm, toy_recording, tmp_path):
     (tmp_path / "toy_arm.yaml").write_text(toy_arm.to_yaml())
-
-    def run_script(name: str, text: str) -> subprocess.CompletedProcess[str]:
-        (tmp_path / name).write_text(text)
-        return subprocess.run(
-            [sys.executable, name],
-            cwd=tmp_path,
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-            capture_output=True,
-            text=True,
-            timeout=200,
-        )
-
-    done = run_script("bare.py", UNGUARDED + CALL)
+    (tmp_path / "bare.py").write_text(UNGUARDED)
+    done = subprocess.run(
+        [sys.executable, "bare.py"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=200,
+    )
     assert done.returncode == 1
     assert done.stderr.count("Traceback") == 1, done.stderr
     last = done.stderr.splitlines()[-1]
@@ -122,10 +105,6 @@ def test_a_script_that_every_worker_would_run_is_told_to_guard_its_call(toy_arm,
     assert last.endswith('put the call under `if __name__ == "__main__":`')
     assert done.stdout.count("imported") <= 3  # this process and its two workers: none was started again
     assert not (tmp_path / "out").exists()
-    done = run_script("guarded.py", UNGUARDED + 'if __name__ == "__main__":\n    ' + CALL)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[0] == "imported"
-    assert "2" in done.stdout.splitlines()
 
 
 def test_one_share_is_done_by_one_job_and_a_whole_job_waits_for_none(toy_arm, toy_recording, tmp_path):
@@ -307,30 +286,19 @@ def test_a_storm_of_kills_ends_with_the_same_bytes(toy_file, out, whole, tmp_pat
     assert files(out) == whole
 
 
-@pytest.mark.slow  # test_engines has both, quickly, without a conversion around them
+@pytest.mark.slow  # test_engines has it, and hangs, without a conversion around them
 @pytest.mark.parametrize("out", ["folder"], indirect=True)
-@pytest.mark.parametrize("kind", ["SIGSEGV", "hang"])
-def test_an_episode_that_crashes_or_hangs_its_reader_is_refused_and_the_rest_kept(
-    kind: str, toy_recording: Path, out: Path, tmp_path: Path
-) -> None:
-    ends(start(tmp_path, toy_recording, out, quiet_s=30, demo_5=kind))
+def test_an_episode_that_crashes_its_reader_is_refused_and_the_rest_kept(toy_recording, out, tmp_path):
+    ends(start(tmp_path, toy_recording, out, demo_5="SIGSEGV"))
     lines = [json.loads(line) for line in (out / "quarantine.jsonl").read_text().splitlines()]
     assert [line["id"] for line in lines] == ["demo_5"]
-    said = "made no progress for 30 s" if kind == "hang" else "ended the process by SIGSEGV"
-    assert said in lines[0]["message"]
+    assert "ended the process by SIGSEGV" in lines[0]["message"]
     assert verify(out) == []
     splits = Manifest.load(out).splits
     assert splits["train"]["episodes"] + splits["val"]["episodes"] == 11
 
 
 # -- several jobs in one place of a store, which has no lock
-
-
-@pytest.mark.parametrize("out", [S3], indirect=True)
-def test_two_equal_jobs_at_once_only_waste_work(toy_file, out, whole, tmp_path) -> None:
-    for process in [start(tmp_path, toy_file, out, workers=0) for _ in range(2)]:
-        ends(process)
-    assert files(out) == whole
 
 
 @pytest.mark.parametrize("out", [S3], indirect=True)
