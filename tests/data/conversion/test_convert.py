@@ -169,26 +169,6 @@ def test_progress_reaches_its_total_in_encoded_frames(toy_arm, toy_file, tmp_pat
     assert seen[-1] == (rows, rows)
 
 
-def test_strided_rows_carry_the_whole_chunk(toy_arm, toy_recording, tmp_path) -> None:
-    run(toy_arm, toy_recording, tmp_path / "out", Settings(frames="strided"))
-    assert verify(tmp_path / "out") == []
-    shards = ShardSet(tmp_path / "out")
-    values = shards.episode_rows(0)
-    with h5py.File(toy_recording) as file:
-        recorded = file["data/demo_0/actions"][()]
-    np.testing.assert_array_equal(values["action"], recorded.reshape(10, 6))
-    assert shards.row_stride == 1
-
-
-def test_statistics_are_over_train_only(toy_set, toy_file) -> None:
-    shards = ShardSet(toy_set)
-    train = [row["id"] for row in shards.episodes.to_pylist() if row["split"] == "train"]
-    with h5py.File(toy_file) as file:
-        actions = np.concatenate([file[f"data/{name}/actions"][()] for name in train]).astype(np.float64)
-    np.testing.assert_allclose(shards.manifest.stats["action"]["mean"], actions.mean(0), rtol=1e-12)
-    np.testing.assert_allclose(shards.manifest.stats["action"]["std"], actions.std(0), rtol=1e-9)
-
-
 def test_an_unknown_rate_is_refused_with_how_to_give_it(toy_arm, toy_recording, tmp_path) -> None:
     unknown = Embodiment.from_yaml(toy_arm.to_yaml().replace("frequency_hz: 10.0", "frequency_hz: unknown"))
     with pytest.raises(RegistryError, match="set frequency_hz"):

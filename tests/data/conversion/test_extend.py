@@ -107,9 +107,16 @@ def test_a_known_episode_that_changed_is_refused_by_its_name(what, toy_arm, reco
     assert shards(out) == before
 
 
-@pytest.mark.parametrize("name", ["episodes.parquet", "quarantine.jsonl", "embodiment.yaml"])
-@pytest.mark.parametrize("damage", ["gone", "blank", "other"])
-@pytest.mark.parametrize("extend", [False, True])
+@pytest.mark.parametrize(
+    ("name", "damage", "extend"),
+    [
+        ("episodes.parquet", "gone", True),
+        ("episodes.parquet", "other", False),
+        ("quarantine.jsonl", "blank", True),
+        ("embodiment.yaml", "gone", False),
+        ("embodiment.yaml", "blank", True),
+    ],
+)
 def test_what_follows_from_the_shards_is_written_anew(
     name: str, damage: str, extend: bool, toy_arm: Embodiment, recording: Path, tmp_path: Path
 ) -> None:
