@@ -67,20 +67,6 @@ def test_every_window_is_its_rows_and_stays_in_its_episode(sets: list[Path]) -> 
         )
 
 
-def test_one_epoch_of_a_mixture_is_every_window_once(sets: list[Path]) -> None:
-    data = MixtureDataset(sets[:1], batch_size=1, frames=FRAMES, lanes=3, pool=2)
-    count = data.mixture.counts[0]
-    lengths = [data._sequence(lane, 0).length for lane in range(3)]
-    assert sum(lengths) == count
-    seen = [
-        (int(e), int(f))
-        for lane, length in enumerate(lengths)
-        for cut in [data._sequence(lane, 0).take(0, length)]
-        for e, f in zip(cut["episode"], cut["frame"], strict=True)
-    ]
-    assert len(set(seen)) == len(seen) == count
-
-
 @pytest.mark.parametrize("stop", [1, 5, 23])
 def test_a_restart_goes_on_with_the_same_windows(sets: list[Path], stop: int) -> None:
     whole = list(islice(MixtureDataset(sets, 6, FRAMES, seed=3), 40))
@@ -201,11 +187,6 @@ def test_a_named_camera_gives_its_own_column(made: Path, name: str) -> None:
     batch = every(made, name)
     assert set(batch.camera.tolist()) == set(camera_of(batch.tokens).tolist()) == {NAMES.index(name)}
     assert torch.equal(batch.tokens[:, :, 0, 0] // 256, batch.frame[:, None] + 2 * torch.arange(VIEW_FRAMES))
-
-
-def test_the_first_is_taken_by_default(made: Path) -> None:
-    windows = WindowDataset(made, "train", VIEW_FRAMES)
-    assert torch.equal(windows.batch(range(len(windows))).tokens, every(made, "top").tokens)
 
 
 def test_views_are_stacked_along_the_height_in_the_order_named(made: Path) -> None:

@@ -142,16 +142,6 @@ def test_a_dataloader_shuffles_windows_by_number(sets: list[Path]) -> None:
     assert sorted(found) == sorted(windows_of(windows.batch(range(len(windows)))))
 
 
-@pytest.mark.parametrize("world", [2, 3])
-def test_ranks_and_lanes_never_share_a_window(sets: list[Path], world: int) -> None:
-    """As long as no lane begins its second epoch; the set's shares differ by a few windows."""
-    runs = [dataset(sets[:1], rank=rank, world=world, lanes=2) for rank in range(world)]
-    share = int(0.8 * runs[0].mixture.counts[0]) // world // SIZE
-    taken = [[w for batch in seen(iter(data), share) for w in batch] for data in runs]
-    assert all(len(set(windows)) == len(windows) == share * SIZE for windows in taken)
-    assert len(set().union(*taken)) == world * share * SIZE
-
-
 @pytest.mark.parametrize("draw", ["per_sample", "per_batch"])
 def test_what_was_taken_follows_the_mixture_and_is_counted(sets: list[Path], draw: Any) -> None:
     data = dataset(sets, draw=draw, temperature=1.0, batch_size=16)

@@ -92,8 +92,3 @@ def test_a_folder_that_is_not_there_is_one_error(words, tmp_path, monkeypatch) -
     assert "nowhere" in str(done.exception)
     assert "\n" not in str(done.exception)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_every_verb_shows_an_example() -> None:
-    for verb in ("info", "verify", "preview", "merge", "split", "restat", "export"):
-        assert "Example: hma shards" in " ".join(run(verb, "--help").stdout.replace("│", " ").split())

@@ -123,17 +123,6 @@ def test_a_constant_stays_exact_however_it_is_merged(sizes: list[int], value: fl
         assert set(np.ravel(list(stats.summary()["quantiles"].values()))) == {np.float64(np.float32(value))}
 
 
-def test_the_mean_of_33_million_constant_rows_is_exact() -> None:
-    block = Stats.of(np.full((2**18, 1), 0.1, np.float32))
-    stats = Stats.empty(1)
-    for _ in range(2**7):  # 2^25 rows, where a sum in float32 has long stopped growing
-        stats.merge(block)
-    assert stats.count == 2**25
-    assert stats.mean[0] == np.float64(np.float32(0.1))
-    assert stats.std[0] == 0
-    assert stats.quantile(0.5)[0] == np.float64(np.float32(0.1))
-
-
 def test_statistics_of_no_rows_are_zeros_and_change_nothing() -> None:
     nothing = Stats.of(np.zeros((0, 3), np.float32))
     assert Stats.empty(3).merge(nothing).count == 0

@@ -7,7 +7,6 @@ import shutil
 import uuid
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -127,25 +126,6 @@ def test_a_listing_that_fails_is_asked_for_again_and_never_short(bucket, monkeyp
     failures += [PermissionError("no")]
     with pytest.raises(StorageError, match="cannot be listed: .*no"):
         list(folder.glob("*/*.bin"))
-
-
-@pytest.mark.parametrize("cache", [True, False])
-def test_a_read_of_one_shard_looks_at_no_other(both: tuple[Path, RemotePath], cache: bool) -> None:
-    looks = []
-
-    class Listed(dict):
-        def __iter__(self) -> Any:
-            looks.append("all")
-            return super().__iter__()
-
-        items = values = keys = __iter__
-
-    shards = ShardSet(both[1], cache=cache)
-    name = shards.manifest.shards[0].path
-    shards.read(name, [0], ["action"])
-    shards.listed = Listed(shards.listed)
-    shards.read(name, [0], ["action"])
-    assert looks == []
 
 
 @pytest.mark.parametrize("cache", [True, False])

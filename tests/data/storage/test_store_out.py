@@ -65,8 +65,9 @@ def test_overwrite_starts_anew_and_foreign_files_are_never_touched(toy_arm, toy_
     run(toy_arm, toy_file, out, settings=replace(SMALL, seed=3))
     with pytest.raises(OutputError, match="belongs to another conversion"):
         run(toy_arm, toy_file, out)
+    put_bytes(b"my notes", out / "README.md")
     run(toy_arm, toy_file, out, overwrite=True)
-    assert files(out) == whole
+    assert files(out) == whole | {"README.md": b"my notes"} and verify(out) == []
     put_bytes(b"mine", out.with_name("other") / "notes.txt")
     with pytest.raises(OutputError, match=r"holds what is not of a shard set: notes\.txt"):
         run(toy_arm, toy_file, out.with_name("other"), overwrite=True)
@@ -227,14 +228,3 @@ def test_a_part_of_a_running_process_is_left(out: RemotePath) -> None:
         (folder / f".shard-00000.parquet.{pid}.part").touch()
     remove_parts(out)
     assert [path.name for path in folder.iterdir()] == [f".shard-00000.parquet.{os.getpid()}.part"]
-
-
-def test_a_card_beside_a_set_of_a_store_stays(toy_arm, toy_file, out, whole) -> None:
-    run(toy_arm, toy_file, out, settings=replace(SMALL, seed=3))
-    put_bytes(b"my notes", out / "README.md")
-    run(toy_arm, toy_file, out, overwrite=True)
-    assert files(out) == whole | {"README.md": b"my notes"}
-    assert verify(out) == []
-    put_bytes(b"mine", out / "notes.txt")
-    with pytest.raises(OutputError, match=r"holds what is not of a shard set: notes\.txt — move it out"):
-        run(toy_arm, toy_file, out)
