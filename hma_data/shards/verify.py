@@ -195,7 +195,8 @@ def _read_rows(path: Path, manifest: Manifest) -> tuple[dict[str, Array], list[s
 def _row_problems(columns: dict[str, Array], footer: Footer) -> list[str]:
     """Check rows against the footer: whole episodes, frames that count up, zeros where nothing is known."""
     found: list[str] = []
-    start, length, number = (to_numpy(footer.table[name]) for name in ("row_start", "length", "episode_index"))
+    names = ("row_start", "length", "episode_index")
+    start, length, number = (to_numpy(footer.table[name]) for name in names)
     frames = np.arange(length.sum()) - np.repeat(start, length)
     if not np.array_equal(columns["episode_index"], np.repeat(number, length)):
         found.append("column episode_index is not what its footer says")
