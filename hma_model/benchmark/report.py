@@ -1,9 +1,7 @@
 """Read results of the benchmark, and show them: a table for a model card, a page, and two compared."""
 
 import json
-import math
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -120,15 +118,6 @@ def title(found: dict[str, Any]) -> str:
 
 def write_report(found: dict[str, Any], folder: Path) -> Path:
     """Write the table for the model card and the page beside the results; return the path of the page."""
-    with _whole(folder / RESULTS):  # results that were finished before may be edited
-        table, page = _shown_whole(found)
-    write_atomic(folder / CARD, table)
-    write_atomic(folder / PAGE, page)
-    return folder / PAGE
-
-
-def _shown_whole(found: dict[str, Any]) -> tuple[str, str]:
-    """Return the table for the model card, and the page."""
     table = Table(COLUMNS, rows(found))
     lead = (
         f"{found['checkpoint']} by {title(found)}: {found['scenes']} scenes of {found['frames']} frames, and "
@@ -145,7 +134,9 @@ def _shown_whole(found: dict[str, Any]) -> tuple[str, str]:
         cells = [[frame, signal, error] for frame, (signal, error) in enumerate(by_frame, 1)]
         page.table(("frame", "PSNR, dB", "state error, px"), cells)
         _calibration(page, one["calibration"])
-    return f"{lead}.\n\n{table.markdown()}\n", page.html()
+    write_atomic(folder / CARD, f"{lead}.\n\n{table.markdown()}\n")
+    write_atomic(folder / PAGE, page.html())
+    return folder / PAGE
 
 
 def _calibration(page: Page, found: dict[str, Any]) -> None:
@@ -198,43 +189,20 @@ def read_results(path: Path) -> dict[str, Any]:
         OutputError: there is none, or it is damaged.
     """
     path = path / RESULTS if path.is_dir() else path
-    with _whole(path):
-        try:
-            text = path.read_text(encoding="utf-8")
-            found = json.loads(text, parse_constant=_finite, parse_float=_finite)
-            if found["benchmark"] != NAME:
-                raise ValueError
-        except (OSError, ValueError, TypeError, KeyError, RecursionError):
-            raise OutputError(path, "holds no results of the benchmark", REMEDY) from None
-    if found.pop("sha256", None) not in (None, digest(found)):  # results of older versions have none
+    try:
+        found = json.loads(path.read_bytes())
+        if found["benchmark"] != NAME:
+            raise ValueError
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
+        raise OutputError(path, "holds no results of the benchmark", REMEDY) from None
+    if found.pop("sha256", "") != digest(found):
         raise OutputError(path, "is damaged or edited: its SHA-256 does not match", REMEDY)
-    with _whole(path):
-        compared(found, found)
-        for figures in found["by_scene"].values():
-            if wrong := [key for key, values in figures.items() if len(values) != found["scenes"]]:
-                raise ValueError(f"{wrong[0]} is not of {found['scenes']} scenes")
     return found
-
-
-def _finite(figure: str) -> float:
-    """Return a number of a JSON text; NaN and what is too large for float64 are no figures."""
-    if not math.isfinite(value := float(figure)):
-        raise ArithmeticError(f"{figure} is none")
-    return value
 
 
 def digest(found: dict[str, Any]) -> str:
     """Return the SHA-256 of results."""
     return short_sha256(json.dumps(found), 64)
-
-
-@contextmanager
-def _whole(path: Path) -> Iterator[None]:
-    """Raise OutputError where the results of a file lack what is done with them."""
-    try:
-        yield
-    except (ArithmeticError, LookupError, TypeError, ValueError, AttributeError) as fault:
-        raise OutputError(path, f"lacks figures ({type(fault).__name__}: {fault})", REMEDY) from fault
 
 
 def compared(one: dict[str, Any], other: dict[str, Any]) -> Table:

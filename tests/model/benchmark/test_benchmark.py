@@ -21,7 +21,7 @@ from hma_model.benchmark import planning
 from hma_model.benchmark import run as running
 from hma_model.benchmark.measures import REACHED_PX, decisions, no_inverse
 from hma_model.benchmark.planning import difference, plan, verdict
-from hma_model.benchmark.report import compared, read_results, rows, write_report
+from hma_model.benchmark.report import compared, digest, read_results, rows, write_report
 from hma_model.benchmark.run import QUICK, RESULTS, WORK, benchmark
 from hma_model.checkpoint import io as checkpoints
 from hma_model.checkpoint.folder import BUNDLED, Checkpoint
@@ -267,35 +267,11 @@ def test_damaged_results_are_refused_with_what_to_do(folders: tuple[Path, Path],
     with pytest.raises(OutputError, match="delete a damaged one to measure again"):
         benchmark("it", tmp_path, TINY, world=world_of(FlawlessWorld))
     whole = (folders[0] / RESULTS).read_text()
-    path.write_text(whole.replace('"decision": 1.0', '"decision": 0.9'))
-    with pytest.raises(OutputError, match="is damaged or edited"):
-        read_results(tmp_path)
-    path.write_text(json.dumps({key: value for key, value in json.loads(whole).items() if key != "sha256"}))
-    assert read_results(path) == read_results(folders[0])  # of an older version
-    without: dict[str, Any] = json.loads(whole) | {"sha256": None}
-    for figures in ({"psnr": 1, "psnr_95": [1.0]}, {"psnr": 10**400}, 1):
-        path.write_text(json.dumps(without | {"measures": dict.fromkeys(without["measures"], figures)}))
-        with pytest.raises(OutputError, match="lacks figures"):
-            read_results(path)
-    for figure in ("NaN", "-Infinity", "1e999"):
-        path.write_text(json.dumps(without).replace('"decision": 1.0', f'"decision": {figure}'))
-        with pytest.raises(OutputError, match=rf"lacks figures \(ArithmeticError: {figure} is none\)"):
-            read_results(path)
-    for scenes in ([1.0], [1.0, 2.0, 3.0, 4.0], [], 7, {"a": 1}):
-        edited: dict[str, Any] = json.loads(whole) | {"sha256": None}
-        edited["by_scene"][ROBOT]["psnr"] = scenes
-        path.write_text(json.dumps(edited))
-        assert main(["benchmark", "--compare", str(folders[0]), str(path)]) == 1
-        with pytest.raises(OutputError, match="benchmark.json: lacks figures"):
-            read_results(path)
-    for key in ("by_scene", "measures", "checkpoint", "scenes"):
-        path.write_text(json.dumps({k: v for k, v in json.loads(whole).items() if k not in (key, "sha256")}))
-        with pytest.raises(OutputError, match="benchmark.json: (lacks figures|holds the results of other)"):
-            benchmark("it", tmp_path, TINY, world=world_of(FlawlessWorld))
-    edited = json.loads(whole)
-    del edited["measures"][ROBOT]["psnr_by_frame"], edited["sha256"]
-    with pytest.raises(OutputError, match="lacks figures .*psnr_by_frame"):
-        write_report(edited, tmp_path)
+    without = {key: value for key, value in json.loads(whole).items() if key != "sha256"}
+    for edited in (whole.replace('"decision": 1.0', '"decision": 0.9'), json.dumps(without)):
+        path.write_text(edited)
+        with pytest.raises(OutputError, match="is damaged or edited"):
+            read_results(tmp_path)
 
 
 def test_finished_results_of_a_killed_job_still_record_meters_and_remove_its_parts(
@@ -308,7 +284,7 @@ def test_finished_results_of_a_killed_job_still_record_meters_and_remove_its_par
     assert all("missing" in other["calibration"] for other in found["measures"].values())
     one["calibration"]["meter"], recorded = {"limit": 2.0}, list[Any]()
     del found["sha256"]
-    (tmp_path / "out" / RESULTS).write_text(json.dumps(found))
+    (tmp_path / "out" / RESULTS).write_text(json.dumps(found | {"sha256": digest(found)}))
     monkeypatch.setattr(running, "record_locally", lambda *given: recorded.append(given[2:]))
     benchmark("it", tmp_path / "out", TINY, world=world_of(FlawlessWorld))
     assert recorded == [(robot, {"limit": 2.0}, "meter")]
