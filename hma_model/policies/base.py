@@ -8,7 +8,7 @@ N scenes, A action dims.
 import random
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -16,7 +16,6 @@ import torch
 from hma_data.arrays import Float32s
 from hma_data.errors import HMAError, UsageError
 from hma_model.policies.arenas import Arena
-from hma_model.policies.judge import StateJudge
 
 
 class Policy(Protocol):
@@ -27,14 +26,6 @@ class Policy(Protocol):
 
     def act(self, arena: Arena) -> Float32s:
         """Return the next actions (N, A)."""
-
-
-@runtime_checkable
-class Judged(Protocol):
-    """A policy that needs the judge of its success, and gets it before it begins."""
-
-    def judged(self, judge: StateJudge) -> None:
-        """Take the judge."""
 
 
 def split_options(kind: str, words: str, known: Mapping[str, type]) -> tuple[str, dict[str, Any]]:

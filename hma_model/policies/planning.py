@@ -147,7 +147,9 @@ def goal_distance(images: Images, goals: Images) -> Floats:
 
 
 class Planning:
-    """Model-predictive control against the judge: plan, give the first chunks, look, and plan again.
+    """Model-predictive control: plan, give the first chunks, look, and plan again.
+
+    What is planned for is the success of the judge that `cost` gets before the policy begins.
 
     Args:
         world: whose model it plans in; the sessions are in a world of its own.
@@ -183,10 +185,6 @@ class Planning:
         self._kind = solver
         self._seed = scenes.seed
         self._sizes = horizon, samples, steps, receding
-
-    def judged(self, judge: StateJudge) -> None:
-        """Take the judge whose success is planned for."""
-        self.cost.judge = judge
 
     def begin(self, arena: Arena) -> None:
         self._follower.begin(arena)

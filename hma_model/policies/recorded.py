@@ -32,9 +32,10 @@ from hma_model.evaluation.agreement import alike_pairs, share_interval
 from hma_model.evaluation.pages import Page
 from hma_model.generation.decode import cameras_for
 from hma_model.policies.arenas import Beginning, ModelArena, Scenes
-from hma_model.policies.base import Judged, Policy, begin, checked
+from hma_model.policies.base import Policy, begin, checked
 from hma_model.policies.catalog import read_policy
 from hma_model.policies.fingerprints import folder_facts
+from hma_model.policies.planning import Planning
 from hma_model.policies.report import rate
 from hma_model.policies.rewards import RewardJudge, labelled_shards, measured_judge
 from hma_model.policies.scores import (
@@ -168,7 +169,7 @@ def evaluate_recorded(
         world = world or load_world(checkpoint, [embodiment], **settings)
         scenes = Scenes.of(world, embodiment, episodes, seed, simulator=False)
         made = [read_policy(one, scenes, world) for one in policies]
-        if planner := next((name for name, one in zip(names, made) if isinstance(one, Judged)), None):
+        if planner := next((name for name, one in zip(names, made) if isinstance(one, Planning)), None):
             raise UsageError(f"policy {planner}", "needs a simulated robot's task", "give another policy")
         labelled = labelled_shards(world, embodiment, shards, judge)
         measured = measured_judge(judge, world, embodiment, labelled, partial(on_progress, 0))

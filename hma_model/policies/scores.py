@@ -52,7 +52,7 @@ from hma_model.evaluation.calibration import Meter, accumulated
 from hma_model.evaluation.intervals import rounded
 from hma_model.generation.commands import OutsideRangeWarning
 from hma_model.policies.arenas import Arena, ModelArena, Scenes, TrueArena
-from hma_model.policies.base import Judged, Policy, begin, checked, kept_randomness, seed_samplers
+from hma_model.policies.base import Policy, begin, checked, kept_randomness, seed_samplers
 from hma_model.policies.catalog import identity, read_policy
 from hma_model.policies.fingerprints import (
     device_facts,
@@ -62,6 +62,7 @@ from hma_model.policies.fingerprints import (
     world_facts,
 )
 from hma_model.policies.judge import StateJudge, task_of, train_judge
+from hma_model.policies.planning import Planning
 from hma_model.policies.scripted import Called
 from hma_model.worlds.world import World, load_world
 
@@ -283,7 +284,7 @@ def evaluate_policies(
         made = [read_policy(one, scenes, world) for one in policies]
         keys = part_keys(policies, world, embodiment, judge) if folder else names
         for name, policy in zip(names, made, strict=True):
-            if not isinstance(policy, Judged):
+            if not isinstance(policy, Planning):
                 # What it returns is refused here, before minutes of work.
                 arena = TrueArena(scenes.take(range(1)), world.image_shape[0])
                 begin(name, policy, arena)
@@ -295,8 +296,8 @@ def evaluate_policies(
                 embodiment, world.tokenizer, scenes.stride, frames + 1, task, seed=seed, tell=told
             )  # fmt: skip
         for policy in made:
-            if isinstance(policy, Judged):
-                policy.judged(judge)
+            if isinstance(policy, Planning):
+                policy.cost.judge = judge
         kept = kept_policies(folder, world, scenes, frames, {"judge": asdict(judge.task)})
         score = partial(score_policy, world=world, scenes=scenes, judge=judge, frames=frames)
         each = play_all(names, made, keys, kept, frames * episodes, on_progress, score)

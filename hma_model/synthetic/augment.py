@@ -37,10 +37,11 @@ from hma_model.evaluation.recorded_state import EPISODES_NEEDED, Reader, recorde
 from hma_model.evaluation.state_reader import Tell
 from hma_model.generation.decode import cameras_for
 from hma_model.policies.arenas import Arena, Beginning, ModelArena, Scenes, TrueArena
-from hma_model.policies.base import Judged, Policy
+from hma_model.policies.base import Policy
 from hma_model.policies.catalog import read_policy
 from hma_model.policies.fingerprints import device_facts, folder_facts, policy_facts, world_digests
 from hma_model.policies.judge import StateJudge, task_of, train_judge
+from hma_model.policies.planning import Planning
 from hma_model.policies.rewards import RewardModel, labelled_shards, measured_judge, names_reward_model
 from hma_model.policies.scores import Progress, choosing_meter, run
 from hma_model.synthetic.recorder import (
@@ -293,7 +294,7 @@ class _Maker:
                 fault = f"{commands!r} needs a policy that acts from images, and {self.robot.id} has none"
                 raise UsageError("--commands", fault, "give replay, perturb=0.3, random or a policy of yours")
             policy = read_policy(commands, self.scenes, self.world)
-            if isinstance(policy, Judged) and (not self.settings.judge or self.settings.rewarded):
+            if isinstance(policy, Planning) and (not self.settings.judge or self.settings.rewarded):
                 fault = f"{commands!r} plans for what a judge calls success"
                 raise UsageError("--commands", fault, "add --judge moved, or another task")
             return policy
@@ -350,11 +351,11 @@ class _Maker:
         self.probe = train_probe(*seen, seed, tell)
         if settings.judge and not settings.rewarded:
             task = task_of(name, settings.judge)
-            self.judge = train_judge(
+            judge = self.judge = train_judge(
                 *seen, settings.frames + 1, task, seed=seed, probe=self.probe, tell=tell
             )  # fmt: skip
-            if isinstance(self.policy, Judged):
-                self.policy.judged(self.judge)
+            if isinstance(self.policy, Planning):
+                self.policy.cost.judge = judge
 
     def _make(self, numbers: range, tell: Callable[[float], None]) -> SyntheticBatch:
         begun = self._simulated(numbers) if self.shards is None else self._recorded(self.shards, numbers)

@@ -4,6 +4,7 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from hma_data.sources.base import open_source
 from hma_model.evaluation.calibration import Meter
 from hma_model.policies.acting import Acting
 from hma_model.policies.arenas import Scenes, TrueArena
+from hma_model.policies.planning import Planning
 from hma_model.policies.scripted import Still
 from hma_model.simulate import World, load_world
 from hma_model.synthetic import augment as augment_module
@@ -198,9 +200,9 @@ def test_first_frames_and_actions_come_from_shards(world: World, real: Path, tmp
 
 
 def test_an_episode_is_in_the_split_of_the_recording_with_which_it_begins(world, tmp_path) -> None:
-    convert(family.embodiment(ROBOT), record(ROBOT, tmp_path, 4), world.tokenizer, tmp_path / "whole")
+    convert(family.embodiment(ROBOT), record(ROBOT, tmp_path, 2), world.tokenizer, tmp_path / "whole")
     split(tmp_path / "whole", tmp_path / "real", val_fraction=0.5, seed=1)
-    augment(tmp_path / "out", asked(source="real"), world=world, shards=tmp_path / "real")
+    augment(tmp_path / "out", asked(source="real", episodes=2), world=world, shards=tmp_path / "real")
     real, made = (ShardSet(tmp_path / name).episodes.to_pylist() for name in ("real", "out"))
     splits = {row["id"]: row["split"] for row in real}
     assert {row["group"]: row["split"] for row in made} == splits and len(set(splits.values())) == 2
@@ -476,9 +478,11 @@ def test_no_recording_is_called_scripted(one_sided: tuple[World, ShardSet], tmp_
 
 
 def test_a_policy_that_plans_gets_the_judge(world, tmp_path, monkeypatch) -> None:
-    class Planning(Still):
-        def judged(self, judge: Any) -> None:
-            self.judge = judge
+    class Planner(Planning):
+        begin, act = Still.begin, Still.act  # type: ignore[assignment]
+
+        def __init__(self) -> None:
+            self.cost: Any = SimpleNamespace()
 
     class Judge:
         def score(self, images: np.ndarray) -> np.ndarray:
@@ -487,11 +491,11 @@ def test_a_policy_that_plans_gets_the_judge(world, tmp_path, monkeypatch) -> Non
         def success(self, scores: np.ndarray) -> np.ndarray:
             return np.ones(len(scores), np.bool_)
 
-    policy, judge = Planning(), Judge()
+    policy, judge = Planner(), Judge()
     monkeypatch.setattr(augment_module, "read_policy", lambda *given: policy)
     monkeypatch.setattr(augment_module, "train_probe", lambda *given: None)
     monkeypatch.setattr(augment_module, "train_judge", lambda *given, **named: judge)
     with pytest.raises(UsageError, match="'plan:cem' plans for what a judge calls success . add --judge"):
         augment(tmp_path / "out", asked(commands="plan:cem"), world=world)
     augment(tmp_path / "out", asked(commands="plan:cem", judge="moved", episodes=2), world=world)
-    assert policy.judge is judge and verify(tmp_path / "out") == []
+    assert policy.cost.judge is judge and verify(tmp_path / "out") == []
