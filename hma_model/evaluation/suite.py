@@ -225,9 +225,6 @@ def judged(found: Mapping[str, Any]) -> dict[str, Any]:
 
 def _folder(out: Path) -> Path:
     """Return the folder of finished parts in an output, made if necessary."""
-    file = next((path for path in (out, *out.parents) if path.is_file()), None)
-    if file:
-        raise OutputError(file, "is a file, not a folder", "name another folder")
     if out.is_dir() and any(out.iterdir()) and not (out / PARTS).is_dir():
         raise OutputError(out, "holds something else than an evaluation", "name a new folder")
     try:

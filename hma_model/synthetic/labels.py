@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 
 from hma_data.arrays import Float32s, Floats
-from hma_data.errors import EpisodeError, HMAError, OutputError, UsageError
+from hma_data.errors import EpisodeError, HMAError, UsageError
 from hma_data.shards.manifest import Manifest
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import Refused
@@ -118,8 +118,6 @@ def label_actions(
     """
     folder = as_path(out)
     find_film(film)
-    if folder.exists() and not folder.is_dir():
-        raise OutputError(folder, "is a file", "name a folder")
     world = world or load_world(checkpoint, [embodiment], device=device)
     model = world.model
     model.require_readout(INVERSE, checkpoint)

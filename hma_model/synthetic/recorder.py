@@ -149,7 +149,6 @@ def holds_dataset(folder: Path, made_by: dict[str, Any]) -> bool:
 
     A dataset gets the folder's name when it is whole, so that one that is there is finished.
     """
-    require_dataset(folder)
     found = lerobot_writer.origin_of(folder.joinpath)
     if not found:
         return False

@@ -189,7 +189,7 @@ def test_the_difference_is_black_where_pictures_are_equal() -> None:
         (["{made}/one", "{made}/arm", "--out", "{made}"], "holds something else than an evaluation"),
         (
             ["{made}/one", "{made}/arm", "--out", "{made}/one/config.json/out"],
-            "config.json: is a file, not a folder",
+            "config.json/out: cannot be written: Not a directory",
         ),
         (["{made}/edited", "{made}/arm"], "edited/trunk.safetensors: missing "),
     ],

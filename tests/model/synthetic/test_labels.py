@@ -145,7 +145,7 @@ def test_what_cannot_be_labelled_is_refused(world: World, tmp_path: Path) -> Non
     with pytest.raises(UsageError, match="nothing: does not exist — give a folder of .mp4"):
         run(tmp_path / "nothing", world=None, checkpoint="no such checkpoint")  # the film is looked at first
     (tmp_path / "out").write_text("")
-    with pytest.raises(OutputError, match="out: is a file"):
+    with pytest.raises(OutputError, match="out: cannot be written"):
         run()
 
 
