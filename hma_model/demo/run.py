@@ -215,7 +215,7 @@ def roll_out(made: DemoRun) -> None:
         lengths = [row["length"] for row in shards.episodes.to_pylist() if row["split"] == "val"]
         prompt = max(2, default_prompt(model.config.frames))
         length = min(LONGEST, max(lengths) // shards.row_stride)
-        window, other = lively_windows(shards, length, prompt, count=FILMED)
+        window, other = lively_windows(shards, length, prompt, FILMED)
         film = rollout_video(
             model,
             tokenizer,

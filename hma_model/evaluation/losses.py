@@ -124,19 +124,18 @@ def digit_frequencies(
     shards: ShardSet,
     factored: Sequence[int],
     cameras: Cameras = FIRST_CAMERA,
-    max_frames: int = BASELINE_FRAMES,
 ) -> list[Floats]:
     """Return the frequency of each value of each digit in train: F arrays (V,), add-one smoothed.
 
     `factored` states the values of each digit, low digit first.
 
-    Of more than `max_frames` frames, only row groups spread evenly over them are counted, about `max_frames`
-    frames at most.
+    Of more than BASELINE_FRAMES frames, only row groups spread evenly over them are counted, so many frames
+    at most.
     """
     counts = [np.ones(values) for values in factored]
     files = list(zip(shards.shards("train"), shards.row_groups("train")))
     groups = [(name, group) for name, rows in files for group in range(len(rows))]
-    stride = max(1, -(-sum(sum(rows) for _, rows in files) // max_frames))
+    stride = max(1, -(-sum(sum(rows) for _, rows in files) // BASELINE_FRAMES))
     columns = Views.of(shards, cameras).columns
     for name, group in groups[::stride]:
         read = shards.read(name, [group], columns)

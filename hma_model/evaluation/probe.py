@@ -30,7 +30,7 @@ from hma_model.evaluation.state_reader import (
 )
 
 TRAINING_STEPS, LEARNING_RATE = 400, 1e-2
-EPISODES, HELD_OUT_EPISODES = 40, 8  # simulated, and of them those that the probe's error is measured on
+EPISODES, HELD_OUT_SHARE = 40, 0.2  # simulated, and the share that the probe's error is measured on
 EPISODE_FRAMES, FRAME_STRIDE = 60, 2  # of an episode; one in so many is kept
 FIRST_EPISODE = 1_000_000  # the number of a probe's first episode; those that are measured count from 0
 LEAST_SPREAD_PX = 1.0  # a part that moves less is no part of the state
@@ -213,7 +213,7 @@ def train_probe(
     def make() -> Probe:
         pictures, made = shown_episodes(robot, tokenizer, stride, seed, tell)
         places, driven = np.concatenate([one.parts for one in made]), made[0].driven
-        return fit(pictures, places, driven, HELD_OUT_EPISODES / EPISODES, seed, tee=tee, tell=tell)
+        return fit(pictures, places, driven, seed, tee, tell)
 
     facts = {"robot": robot, "stride": stride, "seed": seed}
     found = kept_reader("probe", tokenizer, facts, make, PROBE_VALUES, PlaceNetwork)
@@ -242,29 +242,32 @@ def fit(
     pictures: Images,
     parts: Floats,
     driven: int,
-    held_out: float = 0.2,
     seed: int = 0,
-    steps: int = TRAINING_STEPS,
     tee: TeeFinder | None = None,
     tell: Tell = lambda words: None,
 ) -> Probe:
-    """Train a probe on pictures whose state is known.
+    """Train a probe on pictures whose state is known; the last ones only measure its error.
 
     Args:
         pictures: (N, S, S, 3), by episode.
         parts: (N, P, 2) true places in px of 128.
         driven: how many of the parts are the robot's own.
-        held_out: share of the pictures, the last ones, on which the error is measured.
         seed: of the training.
-        steps: of the training.
         tee: of a pusher.
         tell: called with how far it is.
     """
-    used = round(len(pictures) * (1 - held_out))
+    used = round(len(pictures) * (1 - HELD_OUT_SHARE))
     small = resized(pictures)
     targets = (parts[:used] / (truth.SIZE / 2) - 1).reshape(used, -1)
     network = trained(
-        partial(PlaceNetwork, parts.shape[1]), small[:used], targets, seed, steps, LEARNING_RATE, 0.02, tell
+        partial(PlaceNetwork, parts.shape[1]),
+        small[:used],
+        targets,
+        seed,
+        TRAINING_STEPS,
+        LEARNING_RATE,
+        0.02,
+        tell,
     )
     spread = np.linalg.norm(parts - np.median(parts, axis=0), axis=-1).mean(axis=0)
     background = np.median(small[:used], axis=0).astype(np.float32)

@@ -89,7 +89,6 @@ def learn(
     states: Floats,
     recordings: Ints,
     seed: int = 0,
-    steps: int = TRAINING_STEPS,
     tell: Tell = lambda words: None,
 ) -> Reader:
     """Train a reader on pictures whose state is known.
@@ -99,7 +98,6 @@ def learn(
         states: (N, S).
         recordings: (N,) those of the pictures; two or more. The last ones only measure the error.
         seed: of the training.
-        steps: of the training.
         tell: called with how far it is.
     """
     names, counts = np.unique(recordings, return_counts=True)
@@ -110,7 +108,7 @@ def learn(
     mean, std = known.mean(axis=0), known.std(axis=0)
     scaled = (states - mean) / np.maximum(std, LEAST_STD)
     make = partial(StateNetwork, states.shape[1])
-    network = trained(make, small[~other], scaled[~other], seed, steps, LEARNING_RATE, 0.1, tell)
+    network = trained(make, small[~other], scaled[~other], seed, TRAINING_STEPS, LEARNING_RATE, 0.1, tell)
     tested = scaled[other]
     error = np.abs(outputs(network, small[other]) - tested).mean(axis=0)
     spread = np.abs(tested - np.median(tested, axis=0)).mean(axis=0)
@@ -216,7 +214,7 @@ def recorded_reader(
         return None
 
     def make() -> Reader:
-        return learn(decode(tokenizer, seen.stored)[known, 0], wanted[known], recordings, seed, tell=tell)
+        return learn(decode(tokenizer, seen.stored)[known, 0], wanted[known], recordings, seed, tell)
 
     told = file_sha256(shards.folder / MANIFEST)
     return _kept("recorded_reader", tokenizer, {"manifest": told, "cameras": cameras, "seed": seed}, make)
@@ -233,7 +231,7 @@ def simulated_reader(
     def make() -> Reader:
         pictures, made = shown_episodes(robot, tokenizer, stride, seed, tell)
         states = np.concatenate([one.states for one in made]).astype(np.float64)
-        return learn(pictures, states, np.repeat(np.arange(len(made)), len(made[0].states)), seed, tell=tell)
+        return learn(pictures, states, np.repeat(np.arange(len(made)), len(made[0].states)), seed, tell)
 
     return _kept("simulated_reader", tokenizer, {"robot": robot, "stride": stride, "seed": seed}, make)
 

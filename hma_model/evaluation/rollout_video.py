@@ -41,6 +41,7 @@ from hma_model.network.model import HMA
 PANEL_PX = 192  # minimum width in pixels at which a picture is shown
 HOLD_SECONDS = 0.9  # seconds for which the end of a window stands, where another one follows
 GIVEN_COLOUR, PREDICTED_COLOUR = (150, 150, 150), (0, 158, 115)  # borders of true frames and of predictions
+CANDIDATES = 48  # windows from which the liveliest are chosen
 SHEETS = "pictures"  # the folder of a run's sheets
 SHEET_COLUMNS = 8  # frames in a row of a sheet
 TITLE_PX, MARGIN_PX, BORDER_PX = 42, 6, 4  # above a picture, beside it, around it
@@ -140,9 +141,7 @@ def rollout_video(
     return RolloutVideo(frames_shown, fps, prompt, actions.numpy(), images)
 
 
-def lively_windows(
-    shards: ShardSet, length: int, prompt: int, *, count: int = 3, candidates: int = 48
-) -> tuple[list[int], list[int]]:
+def lively_windows(shards: ShardSet, length: int, prompt: int, count: int) -> tuple[list[int], list[int]]:
     """Choose windows in which much moves, and for each the window whose actions differ most from its own.
 
     Of evenly spaced windows those come first in which most tokens change after the prompt; an episode comes
@@ -152,13 +151,12 @@ def lively_windows(
         shards: a shard set of discrete tokens.
         length, prompt: frames of a window, and those of its prompt.
         count: how many held-out windows.
-        candidates: number of windows to choose from.
 
     Returns:
         The numbers of the windows, and the numbers of those with other actions, for `rollout_video`.
     """
     dataset = WindowDataset(shards, "val", length)
-    numbers = evenly(len(dataset), candidates)
+    numbers = evenly(len(dataset), CANDIDATES)
     batch = dataset.batch(numbers)
     assert batch.tokens is not None and batch.episode is not None
     changed = (batch.tokens[:, prompt:] != batch.tokens[:, prompt - 1 : prompt]).float().mean(dim=(1, 2, 3))

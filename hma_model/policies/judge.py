@@ -171,7 +171,6 @@ def train_judge(
     task: Task | None = None,
     *,
     seed: int = 0,
-    examples: int = EXAMPLES,
     probe: Probe | None = None,
     tell: Tell = lambda words: None,
 ) -> StateJudge:
@@ -184,7 +183,6 @@ def train_judge(
         frames: T of the episodes to judge.
         task: by default `moved`.
         seed: of the probe, the episodes and the intervals.
-        examples: recorded episodes for the limit and its test.
         probe: one that is trained already.
         tell: called with how far it is.
 
@@ -203,19 +201,19 @@ def train_judge(
     judge = StateJudge(task, probe, task.limit, accuracy(np.ones(1, bool), np.ones(1, bool)))
 
     def make() -> Arrays:
-        scores = np.empty((2, examples))
-        for row in range(examples):
+        scores = np.empty((2, EXAMPLES))
+        for row in range(EXAMPLES):
             number, wander = FIRST_EPISODE + EPISODES + row, task.name != "placed"
             made = truth.episode(robot, frames, stride, seed, number, looked, wander=wander)
             shown = as_shown(tokenizer, as_seen(robot, tokenizer, made.pictures))
             scores[:, row] = judge.true_score(made.parts[None])[0], judge.score(shown[None])[0]
-            tell(f"training the judge: episode {row + 1} of {examples}")
+            tell(f"training the judge: episode {row + 1} of {EXAMPLES}")
         return {"scores": scores}
 
     facts = {"robot": robot, "task": task.name, "stride": stride, "frames": frames, "seed": seed}
-    facts |= {"examples": examples, "probe": weights_sha256(probe.network)}
+    facts |= {"examples": EXAMPLES, "probe": weights_sha256(probe.network)}
     true, read = kept("judge", tokenizer, facts, make)["scores"]
-    half = examples // 2
+    half = EXAMPLES // 2
     success = true >= task.limit
     limit = best_limit(read[:half], success[:half], task.limit)
     found = accuracy(success[half:], read[half:] >= limit)

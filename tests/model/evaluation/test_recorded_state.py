@@ -1,7 +1,7 @@
 """The recorded state of any robot is read off pictures, and rollouts are compared with it."""
 
+from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import cv2
@@ -17,6 +17,7 @@ from hma_data.lab.family.look import SIZE
 from hma_data.lab.simulator import LabSimulator
 from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
+from hma_model.evaluation import probe as probe_module
 from hma_model.evaluation import recorded_state
 from hma_model.evaluation.losses import windows
 from hma_model.evaluation.probe import Probe, TeeFinder, fit, state_errors
@@ -24,7 +25,7 @@ from hma_model.evaluation.recorded_state import Reader, learn, measure_recorded_
 from recipes.bench.drift import wholeness
 from tests.conftest import BlockTokenizer
 
-PROMPT, STEPS = 2, 100
+PROMPT = 2
 YAML = """
 id: disc
 kind: simulation
@@ -39,6 +40,14 @@ state:
 cameras: [{name: top, key: obs/image}]
 source: {format: hdf5}
 """
+
+
+@pytest.fixture(autouse=True, scope="module")
+def short() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recorded_state, "TRAINING_STEPS", 100)
+        patch.setattr(probe_module, "TRAINING_STEPS", 50)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +86,7 @@ def test_what_is_in_the_picture_is_read_and_the_rest_is_left_out() -> None:
     pictures, parts = scenes(400, 0)
     noise = np.random.default_rng(1).normal(size=(len(parts), 1))
     states = np.concatenate([parts[:, 0] / 1000, noise, np.ones_like(noise)], axis=1)  # metres, say
-    reader = learn(pictures, states, np.arange(len(parts)) // 20, steps=STEPS)
+    reader = learn(pictures, states, np.arange(len(parts)) // 20)
     assert reader.readable.tolist() == [0, 1]
     assert (reader.error[:2] < 0.25).all() and reader.error[2] > 0.6
     moved = states + np.array([reader.std[0], 0, 0, 0])
@@ -90,8 +99,7 @@ def test_what_is_in_the_picture_is_read_and_the_rest_is_left_out() -> None:
 
 
 @pytest.mark.slow
-def test_errors_are_of_the_recorded_steps(disc: ShardSet, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recorded_state, "learn", partial(learn, steps=STEPS))
+def test_errors_are_of_the_recorded_steps(disc: ShardSet) -> None:
     batches = list(windows(disc, "val", 8, 12))
     ahead = [batch.tokens[:, PROMPT:] for batch in batches]  # type: ignore[index]
     made = {"true": ahead, "shuffled": [tokens.roll(1, 0) for tokens in ahead]}
@@ -209,8 +217,8 @@ def scenes(count, seed):
 
 
 @pytest.fixture(scope="module")
-def probe() -> Probe:
-    return fit(*scenes(150, 0), driven=2, steps=50)
+def probe(short: None) -> Probe:
+    return fit(*scenes(150, 0), driven=2)
 
 
 def test_places_are_read_to_a_pixel_or_two_off_other_pictures(probe):
@@ -229,11 +237,12 @@ def test_an_error_is_the_distance_from_the_true_place(probe):
     assert errors.mean() == pytest.approx(50, abs=3)
 
 
-def test_what_does_not_move_or_cannot_be_read_is_no_part_of_the_state():
+def test_what_does_not_move_or_cannot_be_read_is_no_part_of_the_state(monkeypatch):
     pictures, parts = scenes(100, 3)
     parts[:, 0] = (20, 30)  # as of a disc that stands still
     parts[:, 1] = np.random.default_rng(4).uniform(0, SIZE, (100, 2))  # as of one that is not in the picture
-    found = fit(pictures, parts, driven=1, steps=20)
+    monkeypatch.setattr(probe_module, "TRAINING_STEPS", 20)
+    found = fit(pictures, parts, driven=1)
     assert not found.readable.any()
 
 
@@ -244,9 +253,10 @@ def test_wholeness_falls_with_what_is_lost_and_not_with_what_moves(probe):
     np.testing.assert_allclose(found, [1.0, 1.0, 0.5], atol=0.07)
 
 
-def test_the_same_seed_gives_the_same_probe():
+def test_the_same_seed_gives_the_same_probe(monkeypatch):
+    monkeypatch.setattr(probe_module, "TRAINING_STEPS", 3)
     pictures, parts = scenes(60, 5)
-    one, other = (fit(pictures, parts, driven=2, steps=3, seed=7).read(pictures[:4]) for _ in range(2))
+    one, other = (fit(pictures, parts, driven=2, seed=7).read(pictures[:4]) for _ in range(2))
     np.testing.assert_array_equal(one, other)
 
 

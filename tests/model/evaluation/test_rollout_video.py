@@ -28,7 +28,7 @@ def shards(tmp_path_factory: pytest.TempPathFactory) -> ShardSet:
 
 def test_windows_with_motion_come_from_different_episodes_and_get_unlike_actions(shards: ShardSet) -> None:
     dataset = WindowDataset(shards, "val", LENGTH)
-    chosen, others = lively_windows(shards, LENGTH, PROMPT, count=3, candidates=len(dataset))
+    chosen, others = lively_windows(shards, LENGTH, PROMPT, 3)
     batch, everything = dataset.batch(chosen), dataset.batch(range(len(dataset)))
     assert len(set(batch.episode.tolist())) == 3
 

@@ -52,6 +52,7 @@ def episodes(monkeypatch: pytest.MonkeyPatch) -> None:
         )
 
     monkeypatch.setattr(truth, "episode", episode)
+    monkeypatch.setattr(judge, "EXAMPLES", 40)
     for name in ("as_seen", "as_shown"):
         monkeypatch.setattr(judge, name, lambda *given: given[-1])
 
@@ -113,7 +114,6 @@ def test_a_judge_tells_its_accuracy_on_episodes_that_it_was_not_fitted_to(episod
         2,
         12,
         probe=WrittenPlaces(),
-        examples=40,
         tell=told.append,  # type: ignore[arg-type]
     )
     assert made.held_out.balanced == 1 and made.held_out.count == 20
@@ -139,11 +139,9 @@ def test_a_judge_reads_each_image_of_an_episode_once() -> None:
 
 def test_a_judge_that_is_no_better_than_chance_is_refused(episodes: None) -> None:
     with pytest.raises(HMAError, match="judge of rails_03: may be no better than chance: balanced"):
-        train_judge("rails_03", None, 2, 12, probe=WrittenPlaces(True), examples=40)  # type: ignore[arg-type]
+        train_judge("rails_03", None, 2, 12, probe=WrittenPlaces(True))  # type: ignore[arg-type]
     with pytest.raises(HMAError, match="no better than chance: .*all episodes have the same outcome"):
-        train_judge(
-            "rails_03", None, 2, 12, task_of("rails_03", "moved=60"), probe=WrittenPlaces(), examples=40
-        )  # type: ignore[arg-type]
+        train_judge("rails_03", None, 2, 12, task_of("rails_03", "moved=60"), probe=WrittenPlaces())  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("words", ["fly", "moved=far", "moved=0", "reached=999"])
