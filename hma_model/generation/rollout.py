@@ -47,7 +47,7 @@ class Rollout:
         embodiment: one id for all, or one a row.
         batch: B.
         generator: of the seeds of rows that get none.
-        cache: keep keys and values of past frames.
+        cache: keep keys and values of past frames; without, each frame computes them anew.
         compile: compile the passes over one or two frames, on a GPU with CUDA graphs; the first frames then
             take a minute or more. A step of some rows then computes all of them.
         precision: "float32"; "bf16" or "int8" for products in these. In int8 a row's frames depend on the
@@ -77,12 +77,12 @@ class Rollout:
     ) -> None:
         self.model, self.config = model, model.config
         self.decoding = Decoding.of(model.config, **decoding)
-        self.batch, self.caching = batch, cache
+        self.batch = batch
         self.engine = Engine(model, precision, compile and cache)
         Groups.of(embodiment, batch)  # checks that there are as many ids as rows
         names = [embodiment] * batch if isinstance(embodiment, str) else list(embodiment)
         self.state = RowState(model, names, generator, cache)
-        self.passes = Passes(model, self.engine, self.state, cache)
+        self.passes = Passes(model, self.engine, self.state)
         self.told = False  # some prompt had actions
 
     # -- rows ---------------------------------------------------------------------------------------------
@@ -138,7 +138,7 @@ class Rollout:
         rows = [row for row in self._chosen(rows) for _ in range(n)]
         names = [self.state.embodiments[row] for row in rows]
         other = Rollout(
-            self.model, names, len(rows), generator=self.state.shared, cache=self.caching,
+            self.model, names, len(rows), generator=self.state.shared, cache=self.state.caching,
             compile=self.engine.compiled is not None, precision=self.engine.precision,
             **vars(self.decoding),
         )  # fmt: skip
@@ -152,7 +152,7 @@ class Rollout:
     def restore(self, rows: Sequence[int], snapshot: Snapshot) -> None:
         """Put rows into the state of a snapshot of as many rows, from any rollout with the same `cache`."""
         chosen = self._chosen(rows, len(snapshot.times), "snapshot")
-        if snapshot.caching != self.caching:  # frames lie elsewhere, and nothing or too little is computed
+        if snapshot.caching != self.state.caching:  # frames lie elsewhere
             raise HMAError("snapshot", f"is of cache={snapshot.caching}", "restore it into such a rollout")
         if self._clashes(snapshot.passive):
             raise HMAError(
@@ -235,7 +235,7 @@ class Rollout:
         values = self.model.frame_values(frames.unsqueeze(1)).to(self.model.device)[:, 0]
         self._make_room(chosen)
         self._take(chosen, chunk, None, known)  # before the cache, whose tokens it decides
-        if self.caching:
+        if self.state.caching:
             with self.engine.computing(len(chosen)):
                 self.passes.catch_up(chosen)
         self.state.put_frame(chosen, values, generated=False)
@@ -280,12 +280,12 @@ class Rollout:
     def _make_room(self, rows: list[int]) -> None:
         if self.config.released:
             self.state.slide(rows)
-        if not self.caching:
+        if not self.state.caching:
             self.state.grow(rows)
 
     def _frame(self, rows: list[int]) -> Tensor:
         """Return the next frame (n, S) of rows: begin with a masked one, and unmask it step by step."""
-        frame, passes = self._blank(rows), self.passes.begin(rows)
+        frame, shared = self._blank(rows), self.passes.begin(rows)
         left = tokens = self.config.tokens_per_frame
         steps = 1 if self.config.whole_frames else self.decoding.unmask_steps
         for step in range(steps):
@@ -295,12 +295,11 @@ class Rollout:
             first = left == tokens
             if self.engine.whole is not None and isinstance(frame, TokenFrame) and not self.decoding.measure:
                 # One graph for the pass and the choice of tokens; all draws are made before, outside of it.
-                (part,) = passes
-                seen = frame.laid_out(part.lay_out, self.model.token_readout, count)
-                made = self.engine.whole(seen, count, *self.passes.inputs(frame, part, first)).clone()
-                frame.values = made if part.lanes is None else made[part.lanes]
+                seen = frame.laid_out(shared.lay_out, self.model.token_readout, count)
+                made = self.engine.whole(seen, count, *self.passes.inputs(frame, shared, first)).clone()
+                frame.values = made if shared.lanes is None else made[shared.lanes]
             else:
-                features, position = self.passes.features(frame, passes, first)
+                features, position = self.passes.features(frame, shared, first)
                 own = features[:, :tokens]
                 frame.unmask(self.engine.readout, own, position, count)  # type: ignore[arg-type]
             left -= count

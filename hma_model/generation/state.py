@@ -63,20 +63,16 @@ class Pass:
     Attributes:
         past: (rows, T - 1, S) the frames before the new one that the first pass computes.
         times, conditioning: of the T frames.
-        among: numbers of the pass's rows among those of the step; None if they are the same.
         lanes: numbers of the step's rows among those of the pass; None if they are the same.
     """
 
     past: Tensor
     times: TimePositions
     conditioning: Conditioning
-    among: Tensor | None = None
     lanes: Tensor | None = None
 
     def lay_out(self, values: Tensor) -> Tensor:
         """Return values of the step's rows (n, ...) as those of the pass's rows."""
-        if self.among is not None:
-            return values[self.among]
         if self.lanes is None:
             return values
         laid = values.new_zeros(len(self.past), *values.shape[1:])
@@ -91,7 +87,7 @@ class RowState:
         model: the model of the rollout.
         embodiments: the id of each row.
         generator: of the seeds of rows that get none.
-        caching: False keeps all frames, so that R grows.
+        caching: False keeps all frames, so that R grows, and all are computed anew for each frame.
 
     Attributes:
         embodiments: the id of each row.
@@ -180,12 +176,12 @@ class RowState:
         return self.frames[self.tensor(rows), self._slot(rows, 1)]
 
     def given(self, rows: Sequence[int], positions: Tensor) -> ActionConditioning:
-        """Return the chunks (n, T, K) at times (n or 1, T)."""
+        """Return the chunks (n, T, K) at times (n, T)."""
         index, slots = self.tensor(rows).unsqueeze(1), positions % self.slots
         return ActionConditioning(self.chunks[index, slots], self.known[index, slots])
 
     def past(self, rows: Sequence[int], positions: Tensor) -> Tensor:
-        """Return the frames (n, T, S) at times (n or 1, T)."""
+        """Return the frames (n, T, S) at times (n, T)."""
         return self.frames[self.tensor(rows).unsqueeze(1), positions % self.slots]
 
     def slide(self, rows: Sequence[int]) -> None:

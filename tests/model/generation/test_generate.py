@@ -19,6 +19,7 @@ from hma_model.generation.passes import Passes
 from hma_model.generation.rollout import Rollout
 from hma_model.network.draws import randn
 from hma_model.network.model import HMA
+from hma_model.network.trunks.contract import window_times
 from tests.model.network_parts import ARM, seeded, small_batch, small_config, small_model
 from tests.model.robots import make_model, save
 from tests.model.true_world import tiny_model
@@ -83,9 +84,18 @@ def test_every_pass_of_a_cached_rollout_has_the_features_of_full_recomputation(
     seen: list[list[torch.Tensor]] = []
     plain = Passes.features
 
-    def features(self: Passes, frame: Any, part: Any, first: bool) -> tuple[torch.Tensor, torch.Tensor]:
-        found = plain(self, frame, part, first)
+    def features(self: Passes, frame: Any, shared: Any, first: bool) -> tuple[torch.Tensor, torch.Tensor]:
+        found = plain(self, frame, shared, first)
         seen[-1].append(found[0])
+        if not self.state.caching:  # it has all frames; here without slots, as a window in training
+            rows, count = [0, 1, 2], self.state.times[0]
+            times = window_times(model.config, count + 1, "cpu")
+            past = self.state.past(rows, times.positions[:-1].unsqueeze(0))
+            masked = torch.zeros(3, count + 1, past.shape[2], 1, dtype=torch.bool)
+            masked[:, -1] = frame.masked.unsqueeze(-1)
+            x = model.embed(torch.cat([past, frame.values.unsqueeze(1)], dim=1), masked)
+            conditioned = self._condition(rows, times.positions.unsqueeze(0))
+            seen[-1][-1] = model.trunk(x, conditioned, times)[:, -1]
         return found
 
     monkeypatch.setattr(Passes, "features", features)
