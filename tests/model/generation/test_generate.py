@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from hma_data.errors import HMAError
-from hma_data.loading.dataset import Batch
 from hma_model.config import CONDITIONINGS
 from hma_model.generation import commands
 from hma_model.generation.commands import Commands, described
@@ -20,7 +19,7 @@ from hma_model.generation.rollout import Rollout
 from hma_model.network.draws import randn
 from hma_model.network.model import HMA
 from hma_model.network.trunks.contract import window_times
-from tests.model.network_parts import ARM, seeded, small_batch, small_config, small_model
+from tests.model.network_parts import ARM, seeded, small_batch, small_model
 from tests.model.robots import make_model, save
 from tests.model.true_world import tiny_model
 
@@ -268,38 +267,6 @@ def test_the_spread_is_the_standard_deviation_of_the_draws_in_the_tokenizers_uni
     made = rollout.step(torch.ones(1, ARM.chunk_dim))
     assert made.std().item() == pytest.approx(0.4, rel=0.05)
     assert rollout.uncertainty.item() == pytest.approx(0.4, rel=0.05)
-
-
-@pytest.mark.slow
-def test_a_trained_model_is_less_sure_of_what_nobody_can_know() -> None:
-    """A command of 1 leads to a frame that is always the same, one of -1 to one of ±1 everywhere."""
-    torch.manual_seed(0)
-    config = small_config(
-        kind="continuous", grid=(4, 4), channels=1, latent_scale=1.0, frames=2, corrupt_max=0.0,
-        history_probability=0.0, training_pass="pairs", whole_share=1.0,
-    )  # fmt: skip
-    model = HMA(config)
-    model.add_embodiment(replace(ARM, mean=(0.0,) * 3, std=(1.0,) * 3))
-    optimizer, steps = torch.optim.AdamW(model.parameters(), 5e-3), 400
-    for step in range(steps):
-        optimizer.param_groups[0]["lr"] = 5e-3 * (1 - step / steps)
-        command = torch.randint(0, 2, (16,)) * 2.0 - 1
-        sign = torch.randint(0, 2, (16,)) * 2.0 - 1
-        after = torch.where(command > 0, 0.5, sign)
-        film = torch.stack([torch.zeros(16), after], dim=1)[:, :, None, None, None].expand(-1, -1, 1, 4, 4)
-        chunks = command[:, None, None].expand(-1, 2, ARM.chunk_dim).contiguous()
-        known = torch.ones(16, 2, dtype=torch.bool)
-        loss = model(Batch(["arm"] * 16, chunks, known, latents=film.contiguous()), "forward").loss
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    rollout = measuring(model.eval(), "arm", 16, unmask_steps=1)
-    rollout.prompt(torch.zeros(16, 1, 1, 4, 4), None, seeds=range(16))
-    command = torch.tensor([1.0, -1.0]).repeat(8)
-    made = rollout.step(command[:, None].expand(-1, ARM.chunk_dim))
-    sure, unsure = rollout.uncertainty[0::2], rollout.uncertainty[1::2]
-    assert (made[0::2].mean((1, 2, 3)) - 0.5).abs().max() < 0.1
-    assert sure.max() < 0.2 and unsure.min() > 0.5
 
 
 # -- the range of commands

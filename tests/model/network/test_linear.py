@@ -67,19 +67,16 @@ def test_frozen_weights_and_autocast():
 
 
 KEPT = """
-import os, sys
+import os
 import hma_model.network.linear
-assert os.environ["ONEDNN_PRIMITIVE_CACHE_CAPACITY"] == sys.argv[1]
+assert os.environ["ONEDNN_PRIMITIVE_CACHE_CAPACITY"] == "64"
 """
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("given", [None, "7"])
-def test_few_products_are_kept_unless_the_user_says_otherwise(given, monkeypatch):
+def test_few_products_are_kept(monkeypatch):
     monkeypatch.delenv("ONEDNN_PRIMITIVE_CACHE_CAPACITY", raising=False)
-    if given:
-        monkeypatch.setenv("ONEDNN_PRIMITIVE_CACHE_CAPACITY", given)
-    run_fresh(KEPT, given or "64")
+    run_fresh(KEPT)
 
 
 def _attended(dtype: torch.dtype, length: int, masked: str) -> list[Tensor]:
@@ -103,13 +100,14 @@ def test_attention_agrees_with_float32(length: int, masked: str, monkeypatch: py
         assert (exact - near).norm() < 0.02 * exact.norm()
 
 
-def test_rotation_agrees_with_float32() -> None:
+@pytest.mark.parametrize(("dtype", "error"), [(torch.float32, 1e-6), (torch.bfloat16, 0.01)])
+def test_the_fast_rotation_agrees_with_the_plain_one_in_float64(dtype, error) -> None:
     qkv = torch.randn(5, 12, 3, 2, 16, generator=torch.Generator().manual_seed(1))
     angles = torch.randn(12, 8, generator=torch.Generator().manual_seed(2))
     rotary = (angles.cos(), angles.sin())
-    for exact, near in zip(rotate_qkv(qkv, rotary), rotate_qkv(qkv.bfloat16(), rotary), strict=True):
-        assert near.dtype == torch.bfloat16
-        assert (exact - near.float()).norm() < 0.01 * exact.norm()
+    for exact, near in zip(rotate_qkv(qkv.double(), rotary), rotate_qkv(qkv.to(dtype), rotary), strict=True):
+        assert near.dtype == dtype
+        assert (exact - near.double()).norm() < error * exact.norm()
 
 
 def torchs(features, linear, gains, before, digits):

@@ -98,12 +98,7 @@ def _overfit(objective: str, steps: int, **changes: Any) -> list[float]:
 
 OVERFITS = [  # objective, changes, steps, share of the first losses that the last ones stay below
     ("forward", {}, 120, 0.06),
-    *(
-        (name, {}, {"passive": 600, "full": 400}.get(name, 200), 0.06)
-        for name in OBJECTIVES
-        if name != "forward"
-    ),
-    ("forward", {"conditioning": CONDITIONINGS}, 200, 0.06),
+    ("policy", {}, 200, 0.06),
     # the noise of a nearly clean sample stays unknown
     ("policy", {"action_loss": "diffusion"}, 200, 0.5),
     ("forward", {"kind": "continuous", "grid": (4, 4)}, 200, 0.5),
@@ -114,7 +109,7 @@ OVERFITS = [  # objective, changes, steps, share of the first losses that the la
     ("objective", "changes", "steps", "share"),
     [OVERFITS[0], *(pytest.param(*one, marks=pytest.mark.slow) for one in OVERFITS[1:])],
 )
-def test_each_objective_conditioning_and_head_overfits_a_handful_of_windows(objective, changes, steps, share):
+def test_each_head_overfits_a_handful_of_windows(objective, changes, steps, share):
     losses = _overfit(objective, steps, **changes)
     assert sum(losses[-20:]) / 20 < share * sum(losses[:5]) / 5
 

@@ -8,7 +8,7 @@ from hma_data.errors import HMAError
 from hma_model.config import ActionSpace
 from hma_model.network.conditioning import ActionConditioning, Groups
 from hma_model.network.model import HMA
-from hma_model.network.rotary import rotary_angles, rotate, rotate_qkv
+from hma_model.network.rotary import rotary_angles, rotate
 from hma_model.network.stem import Normalizer
 from hma_model.network.trunks import transformer
 from hma_model.network.trunks.contract import TimePositions, paired_times
@@ -117,13 +117,6 @@ def test_rotary_scores_depend_on_the_distance_alone() -> None:
 
     assert torch.allclose(score(3, 1), score(103, 101), atol=1e-4)
     assert not torch.allclose(score(3, 1), score(3, 2), atol=1e-3)
-
-
-def test_the_fast_rotation_equals_the_plain_one() -> None:
-    qkv = torch.randn(2, 5, 3, 4, 8)
-    angles = rotary_angles(small_model().config, torch.arange(5))
-    fast, plain = rotate_qkv(qkv, angles), rotate_qkv(qkv.double(), angles)
-    assert all(torch.allclose(a.double(), b, atol=1e-6) for a, b in zip(fast, plain))
 
 
 @pytest.mark.parametrize("frames", [1, 2])
