@@ -31,7 +31,6 @@ from hma_model.hub.stores import Store, open_store
 _OWN_FILES = {*SMALL, MANIFEST, *FILES_BESIDE}
 _PULL_AGAIN = "pull again; if the error stays, push it again"
 _DATASETS = "hf://datasets/"
-_BOUNDS = ("1K", "10K", "100K", "1M", "10M", "100M", "1B", "10B", "100B", "1T")  # of the hub's categories
 _SPLITS = {"train": "train", "val": "validation"}  # our names, and the hub's names
 
 
@@ -193,7 +192,6 @@ def _present(manifest: Manifest) -> list[str]:
 
 
 def _front(manifest: Manifest) -> dict[str, Any]:
-    rows = sum(shard.rows for shard in manifest.shards)
     frames = [{"split": _SPLITS[split], "path": f"{split}/*.parquet"} for split in _present(manifest)]
     configs = [{"config_name": "frames", "data_files": frames, "default": True}]
     episodes = {"split": "train", "path": EPISODES}  # of both splits; datasets reserves the name "all"
@@ -201,21 +199,10 @@ def _front(manifest: Manifest) -> dict[str, Any]:
     return {
         **licence([manifest.embodiment.license]),
         "task_categories": ["robotics"],
-        "size_categories": [_size_category(rows)],
         "tags": ["robotics", "hma", "world-model", f"embodiment:{manifest.embodiment.id}",
                  f"tokenizer:{manifest.tokenizer.name}"],
         "configs": configs if frames else configs[1:],
     }  # fmt: skip
-
-
-def _size_category(rows: int) -> str:
-    """Return the hub's word for a number of rows, such as `10K<n<100K`."""
-    reached = max(0, len(str(rows)) - 3)  # bounds, each ten times the one before
-    if reached == 0:
-        return f"n<{_BOUNDS[0]}"
-    if reached >= len(_BOUNDS):
-        return f"n>{_BOUNDS[-1]}"
-    return f"{_BOUNDS[reached - 1]}<n<{_BOUNDS[reached]}"
 
 
 def _rows(manifest: Manifest) -> list[list[str]]:

@@ -13,7 +13,7 @@ from hma_data.errors import HubError, ShardError
 from hma_data.shards.reader import ShardSet
 from hma_data.tokenizers.shapes import palette_spec
 from hma_model.hub import stores
-from hma_model.hub.datasets import _size_category, pull_data, push_data
+from hma_model.hub.datasets import pull_data, push_data
 from hma_model.hub.stores import FolderStore
 from tests.conftest import SMALL, contents, toy_shards
 from tests.hub_server import Hub
@@ -143,12 +143,6 @@ def test_a_set_of_other_colours_is_not_pushed_over_another(server, tmp_path):
     push_data(tmp_path / "own", REPO)
     with pytest.raises(HubError, match="holds the shard set of arm under palette-64 .*, not of arm under"):
         push_data(tmp_path / "other", REPO)
-
-
-def test_the_hub_is_told_how_many_rows_there_are():
-    rows = (0, 999, 1000, 10**10 - 1, 10**10, 10**12 - 1, 10**12)
-    named = ["n<1K", "n<1K", "1K<n<10K", "1B<n<10B", "10B<n<100B", "100B<n<1T", "n>1T"]
-    assert list(map(_size_category, rows)) == named
 
 
 def test_an_interrupted_pull_goes_on_file_by_file(server, shards, tmp_path):
