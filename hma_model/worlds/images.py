@@ -57,12 +57,12 @@ def read_image(path: StrPath, remedy: str = REMEDY) -> Images:
         raise UsageError(path, *(misplaced(path, "an image") or ("is not an image", remedy))) from fault
 
 
-def as_numbers(name: str, values: ArrayLike) -> Float32s:
-    """Return what a caller gives as an array; raise HMAError if it is none of numbers."""
+def as_chunks(values: ArrayLike) -> Float32s:
+    """Return the chunks that a caller gives as an array; raise HMAError if they are none of numbers."""
     try:
         return np.asarray(values, np.float32)
     except (TypeError, ValueError) as fault:
-        raise HMAError("prompt", f"its {name} are no array of numbers", "give rows of one length") from fault
+        raise HMAError("prompt", "its chunks are no array of numbers", "give rows of one length") from fault
 
 
 def image_shape(config: HMAConfig) -> tuple[int, int, int]:

@@ -1,6 +1,6 @@
 """Read the frames that a session starts from: shards, images, recordings, simulators.
 
-P frames of a prompt, T frames of an episode, A action dims, K = stride · A.
+P frames of a prompt, T frames of an episode, K = stride · action dim.
 """
 
 import tempfile
@@ -21,6 +21,7 @@ from hma_data.lab import record
 from hma_data.lab.simulator import simulated
 from hma_data.loading.views import Cameras
 from hma_data.registry.embodiment import Embodiment
+from hma_data.registry.export import packed_components
 from hma_data.shards.manifest import MANIFEST
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.windows import episode_pieces, pieces
@@ -30,7 +31,7 @@ from hma_model.checkpoint.folder import require_tokenizer
 from hma_model.generation.commands import described, yaml_of
 from hma_model.generation.decode import cameras_for, trained_cameras, trained_shards
 from hma_model.network.model import HMA
-from hma_model.worlds.images import Prompt, as_numbers, read_image, recorded_cameras, seen_cameras
+from hma_model.worlds.images import Prompt, as_chunks, read_image, recorded_cameras, seen_cameras
 
 PROMPT_FORMS = (
     "give an image or images, an image's file, a folder of shards or of a LeRobotDataset, an environment "
@@ -103,7 +104,6 @@ def read_prompt(model: HMA, embodiment: str, prompt: Any = None, *, seed: int = 
             a mapping: "shards" or "lerobot": that folder, and if wanted "episode": number or id, "start": its
             first frame as recorded, "frames": P; they may cross no pause;
             a mapping: "frames": images at the model's rate, and "chunks": (P - 1, K);
-            a mapping: "frames": images at the control rate, T of them, and "actions": (T - 1, A);
             an environment whose render() returns an image.
         seed: of a simulated prompt.
 
@@ -172,12 +172,9 @@ def _of_mapping(model: HMA, embodiment: str, prompt: Mapping[str, Any]) -> Promp
             if not isinstance(folder, str | PathLike):
                 raise HMAError("prompt", f"{key} is {folder!r}, not a folder", PROMPT_FORMS)
             return read(model, embodiment, folder, EpisodePart(**given))
-    if "frames" not in given or given.keys() - {"frames", "chunks", "actions"}:
+    if "frames" not in given or given.keys() - {"frames", "chunks"}:
         raise HMAError("prompt", f"has the keys {', '.join(map(str, given))}", PROMPT_FORMS)
-    frames = _array(given["frames"])
-    if "actions" in given:
-        return _strided(model, embodiment, frames, given["actions"])
-    return _of_frames(model, embodiment, frames, given.get("chunks"))
+    return _of_frames(model, embodiment, _array(given["frames"]), given.get("chunks"))
 
 
 def _array(images: Any) -> NDArray[Any]:
@@ -193,20 +190,7 @@ def _of_frames(model: HMA, embodiment: str, frames: NDArray[Any], chunks: ArrayL
         described(model, embodiment)  # raises if the model lacks it
         width = model.embodiments[embodiment].chunk_dim
         chunks = np.full((max(0, len(frames) - 1), width), np.nan)
-    return Prompt(frames, as_numbers("chunks", chunks))
-
-
-def _strided(model: HMA, embodiment: str, frames: NDArray[Any], actions: ArrayLike) -> Prompt:
-    """Return every stride-th frame, the last one included, and the chunks between them."""
-    described(model, embodiment)
-    space = model.embodiments[embodiment]
-    values = as_numbers("actions", actions)
-    if values.shape != (len(frames) - 1, space.action_dim):
-        fault = f"has actions of the shape {values.shape} for {len(frames)} frames"
-        raise HMAError("prompt", fault, f"give ({len(frames) - 1}, {space.action_dim})")
-    steps = (len(frames) - 1) // space.stride
-    first = len(frames) - 1 - steps * space.stride
-    return Prompt(frames[first :: space.stride], values[first:].reshape(steps, space.chunk_dim))
+    return Prompt(frames, as_chunks(chunks))
 
 
 # -- episodes
@@ -279,11 +263,6 @@ def _as_lerobot(robot: Embodiment, folder: StrPath) -> Embodiment:
     keys = [key.key for key in open_source("lerobot").inspect(folder, 1).keys if key.kind == "camera"]
     if len(keys) < len(robot.cameras):
         raise HMAError(folder, f"has {len(keys)} cameras, {robot.id} has {len(robot.cameras)}", PROMPT_FORMS)
-    values = robot.to_dict()
-    parts = [
-        {"key": "action", "dims": part.dims, "slice": [span.start, span.stop]}
-        for part, span in robot.action.spans()
-    ]
     named = {key.rpartition(".")[2]: key for key in keys}
     paired = {camera.name: named[camera.name] for camera in robot.cameras if camera.name in named}
     rest = (key for key in keys if key not in paired.values())
@@ -291,11 +270,16 @@ def _as_lerobot(robot: Embodiment, folder: StrPath) -> Embodiment:
         {"name": camera.name, "key": paired.get(camera.name) or next(rest), "resize": camera.resize}
         for camera in robot.cameras
     ]
-    action = {"space": robot.action.space, "components": parts}
-    changed: dict[str, Any] = {"action": action, "cameras": cameras, "source": {"format": "lerobot"}}
-    changed |= {"state": None, "sync": {"primary": robot.sync.primary}}
-    kept = {key: value for key, value in values.items() if key not in ("state", "sync", "quality")}
-    return Embodiment.from_values({**kept, **changed}, f"{folder}, as {robot.id}")
+    values = robot.to_dict()
+    for key in ("state", "quality"):  # of the other recordings
+        values.pop(key, None)
+    values |= {
+        "action": {"space": robot.action.space, "components": packed_components(values["action"], "action")},
+        "cameras": cameras,
+        "sync": {"primary": robot.sync.primary},
+        "source": {"format": "lerobot"},
+    }
+    return Embodiment.from_values(values, f"{folder}, as {robot.id}")
 
 
 def _of_recording(model: HMA, robot: Embodiment, recording: Path, part: EpisodePart) -> Prompt:

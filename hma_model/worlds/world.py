@@ -33,7 +33,7 @@ from hma_model.generation.rollout import Rollout
 from hma_model.generation.state import Snapshot as Snapshot
 from hma_model.generation.unmask import Decoding, check
 from hma_model.network.model import HMA
-from hma_model.worlds.images import as_numbers, fitted, image_shape
+from hma_model.worlds.images import as_chunks, fitted, image_shape
 
 
 @dataclass(frozen=True)
@@ -324,7 +324,7 @@ class World:
         stored = self.encoded(embodiment, np.asarray(frames)[-self.model.config.frames :])
         if chunks is None:
             chunks = np.full((len(frames) - 1, spec.stride * len(spec.names)), np.nan)
-        chunks = as_numbers("chunks", chunks)
+        chunks = as_chunks(chunks)
         if len(chunks) != len(frames) - 1:
             fault = f"has {len(chunks)} chunks for {len(frames)} frames"
             raise HMAError("prompt", fault, f"give {len(frames) - 1}, one from each frame to the next")

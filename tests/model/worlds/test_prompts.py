@@ -88,14 +88,6 @@ def test_images_come_as_arrays_files_and_from_environments(model: HMA, tmp_path:
             assert len(chunks) == count - 1 and np.isnan(chunks).all()
 
 
-def test_frames_at_the_control_rate_become_chunks_that_end_at_the_last_frame(model: HMA) -> None:
-    frames = np.arange(12, dtype=np.uint8)[:, None, None, None].repeat(3, axis=3)
-    actions = np.arange(22, dtype=np.float32).reshape(11, 2)
-    kept, chunks = read_prompt(model, RAILS, {"frames": frames, "actions": actions})  # its stride is 5
-    assert kept[:, 0, 0, 0].tolist() == [1, 6, 11]
-    assert chunks is not None and chunks.tolist() == [list(range(2, 12)), list(range(12, 22))]
-
-
 @pytest.mark.slow
 def test_a_lerobot_episode_is_a_prompt_of_the_same_robot_recorded_elsewhere(arm, tmp_path) -> None:
     dataset = record("planar_arm_lerobot", tmp_path, 2)
@@ -135,8 +127,6 @@ def test_cameras_recorded_elsewhere_are_paired_by_name_and_the_primary_one_stays
         ("tests", "tests: is a folder, not an image — give an image or images"),
         ("README.md", "README.md: is not an image — give an image or images"),
         ("no/such.png", "cannot be read: No such file or directory — give an image"),
-        ({"frames": np.zeros((3, 8, 8, 3), np.uint8), "actions": np.zeros((3, 2))}, r"give \(2, 2\)"),
-        ({"frames": np.zeros((3, 8, 8, 3), np.uint8), "actions": [[1, 2], [1]]}, "its actions are no array"),
         ({"frames": np.zeros((3, 8, 8, 3), np.uint8), "chunks": "abc"}, "its chunks are no array of numbers"),
         ({"frames": [[1, 2], [1]]}, "its images differ in size"),
         ({"shards": 5}, "shards is 5, not a folder — give an image or images"),
