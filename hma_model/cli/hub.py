@@ -132,7 +132,7 @@ def listing(
             [*(_cell(row[key]) for key in columns), _megabytes(row["bytes"]), _state(row)]
             for row in facts["embodiments"]
         ]
-        print(_summary(facts))
+        say(_summary(facts))
         shown = [i for i in range(len(columns) + 2) if i == 0 or any(row[i] is not None for row in rows)]
         if rows:
             names = [*columns, "MB", "state"]
@@ -239,7 +239,5 @@ def _state(facts: dict[str, Any]) -> str:
 
 
 def _cell(value: Any, most: int = 80) -> Any:
-    """Return an untrusted value that a terminal may show: a number, or text without control characters."""
-    if value is None or (isinstance(value, int | float) and not isinstance(value, bool)):
-        return value
-    return "".join(c if c.isprintable() else "?" for c in str(value))[:most]
+    """Return an untrusted value as it is shown: a number, or text that is not too long."""
+    return value if value is None or isinstance(value, int | float) else str(value)[:most]
