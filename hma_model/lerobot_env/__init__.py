@@ -195,22 +195,14 @@ def require_fit(config: HMAEnvConfig) -> None:
     renamed = yaml.safe_load(parser.parse_arg("rename_map") or "{}") or {}
     own = {config.features_map[key]: one for key, one in config.features.items() if key != SYNTHETIC}
     given = {renamed.get(key, key): feature for key, feature in own.items()}
-    where = f"policy {path}"
     for key, feature in {**policy.input_features, **policy.output_features}.items():
         there = given.get(key)
-        if there is None and feature.type is FeatureType.VISUAL:
-            camera = next(name for name, one in own.items() if one.type is FeatureType.VISUAL)
-            remedy = f"""rename it: --rename_map='{{"{camera}": "{key}"}}'"""
-            raise UsageError(where, f"takes {key}, and {config.embodiment} gives {', '.join(own)}", remedy)
-        if there is None:
-            fault = f"takes {key}, which cannot be estimated from the images of {config.embodiment} here"
-            remedy = "give a policy that acts from images alone"
-            if key == "observation.state" and not config.state:
-                fault, remedy = f"takes {key}, and --env.state=false omits it", "leave out --env.state"
-            raise UsageError(where, fault, remedy)
-        if feature.type is not FeatureType.VISUAL and tuple(there.shape) != tuple(feature.shape):
-            fault = f"has {feature.shape[0]} values of {key}, {config.embodiment} has {there.shape[0]}"
-            raise UsageError(where, fault, "give a policy of this robot")
+        if there and (feature.type is FeatureType.VISUAL or tuple(there.shape) == tuple(feature.shape)):
+            continue
+        offered = ", ".join(f"{name} {tuple(one.shape)}" for name, one in given.items())
+        fault = f"takes {key} {tuple(feature.shape)}, and {config.embodiment} gives {offered}"
+        remedy = "give a policy of this robot, --env.state=true, or other names by --rename_map"
+        raise UsageError(f"policy {path}", fault, remedy)
 
 
 @contextmanager

@@ -154,18 +154,17 @@ def test_a_robot_without_a_start_is_refused_before_anything_is_trained(tmp_path,
 @pytest.mark.parametrize(
     ("inputs", "rename", "state", "said"),
     [
-        ({}, "", True, f"""takes {CAMERA}, and {ROBOT} gives action, observation.image,"""),
-        ({"state": 2}, RENAME, False, "takes observation.state, and --env.state=false omits it"),
-        ({"state": 3}, RENAME, True, f"has 3 values of observation.state, {ROBOT} has 2"),
-        ({"actions": 3}, RENAME, True, f"has 3 values of action, {ROBOT} has 2"),
+        ({}, "", True, rf"takes {CAMERA} \(.*\), and {ROBOT} gives action \(2,\), observation.image \("),
+        ({"state": 2}, RENAME, False, r"takes observation.state \(2,\), and .* --env.state=true"),
+        ({"actions": 3}, RENAME, True, rf"takes action \(3,\), and {ROBOT} gives action \(2,\)"),
     ],
 )  # fmt: skip
 def test_a_policy_that_does_not_fit(inputs, rename, state, said, tmp_path, monkeypatch) -> None:
     saved(tmp_path, **inputs)
     monkeypatch.setattr(sys, "argv", ["lerobot-eval", f"--policy.path={tmp_path}", rename])
-    with pytest.raises(SystemExit, match="error: policy ") as fault:
+    with pytest.raises(SystemExit, match=f"error: policy .*{said}") as fault:
         HMAEnvConfig(embodiment=ROBOT, state=state).create_envs(1)
-    assert said in str(fault.value) and "\n" not in str(fault.value)
+    assert "\n" not in str(fault.value)
 
 
 def test_a_published_checkpoint_makes_environments(server: Hub) -> None:
