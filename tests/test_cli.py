@@ -166,8 +166,8 @@ def test_progress_names_the_robot_not_its_file(toy_yaml: Path, tmp_path: Path) -
 
 @pytest.mark.parametrize("verb", ["train discrete_tiny nowhere", "finetune nowhere --from embedded"])
 def test_a_key_written_as_an_option_is_answered_by_how_to_write_it(verb: str) -> None:
-    fails(hma(*verb.split(), "--steps", "10"), 2, "write steps=10")
-    fails(hma(*verb.split(), "--batch-size=4"), 2, "write batch_size=4")
+    fails(hma(*verb.split(), "--steps", "10"), 2, "write steps=VALUE")
+    fails(hma(*verb.split(), "--batch-size=4"), 2, "write batch_size=VALUE")
     fails(hma(*verb.split(), "--nonsense", "1"), 2, "--help")
 
 

@@ -142,7 +142,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return 2  # the help has been shown
         hint = f" — see {context.command_path} --help" if context else ""
         if context and context.info_name in ("train", "finetune"):
-            key = cli_train.unknown_option(getattr(fault, "option_name", "") or "", words)
+            key = cli_train.unknown_option(getattr(fault, "option_name", "") or "")
             hint = f" — {key}" if key else hint
         said = fault.format_message().replace("Value error, ", "").replace("Input should be", "must be")
         return fail(said + hint, 2)

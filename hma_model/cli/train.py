@@ -1,7 +1,6 @@
 """Define the commands `hma train` and `hma finetune`, and those of `hma recipe`."""
 
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -70,19 +69,12 @@ def _data(folders: list[str]) -> str:
     return f"data={folders}"  # as YAML has a list of texts
 
 
-def unknown_option(option: str, words: Sequence[str]) -> str:
-    """Return how to write an option that is a key of recipes, such as `steps=10`; empty if it is none."""
+def unknown_option(option: str) -> str:
+    """Return how to write an option that is a key of recipes; empty if it is none."""
     from hma_model.training.recipe import Recipe
 
-    name, _, value = option.lstrip("-").partition("=")
-    key = name.replace("-", "_")
-    if key.partition(".")[0] not in Recipe.model_fields:
-        return ""
-    given = next((word.partition("=")[2] for word in words if word.startswith(f"{option}=")), value)
-    if not given and option in words:
-        after = words[words.index(option) + 1 :]
-        given = after[0] if after else ""
-    return f"write {key}={given or 'VALUE'}"
+    key = option.lstrip("-").partition("=")[0].replace("-", "_")
+    return f"write {key}=VALUE" if key.partition(".")[0] in Recipe.model_fields else ""
 
 
 def _refuse_early(recipe: str, overrides: list[str]) -> None:
