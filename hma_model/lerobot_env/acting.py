@@ -113,8 +113,6 @@ class WorldModelPolicy(PreTrainedPolicy):
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **unused: Any) -> Tensor:
         """Return the actions (N, stride, A) from the newest images on; the next call counts them as taken."""
-        while self._steps % self._stride:  # what is left of a chunk counts as carried out
-            self.select_action(batch)
         return torch.stack([self.select_action(batch) for _ in range(self._stride)], dim=1)
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Any] | None]:

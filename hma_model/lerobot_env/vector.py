@@ -114,8 +114,9 @@ class LeRobotVectorEnv(WorldModelVectorEnv):
             num_envs, embodiment=embodiment, world=world, horizon=horizon, render_mode="rgb_array", **settings
         )
         self.metadata = self.metadata | {"render_fps": max(1, round(self.metadata["render_fps"]))}
-        self.task = self.task_description = task or embodiment
-        self._max_episode_steps = horizon
+        told = {"task": task or embodiment, "task_description": task or embodiment}
+        for name, value in (told | {"_max_episode_steps": horizon}).items():
+            self.set_attr(name, value)  # lerobot asks each environment
         self._judged_by, self._judge_from = judge, judge_from
         self._task = None if judge is None else judged_task(embodiment, judge)
         self._cameras = camera_names(checkpoint, embodiment)
@@ -168,7 +169,7 @@ class LeRobotVectorEnv(WorldModelVectorEnv):
             return found.model
         log.warning("%s: the judge is trained once, in minutes, and kept", self.embodiment)
         spec = self.envs[0].action_spec
-        frames = self._max_episode_steps // spec.stride + 1
+        frames = self.envs[0].horizon // spec.stride + 1
         judge = train_judge(
             self.embodiment, self.world.tokenizer, spec.stride, frames, self._task,
             tell=progress_log(self.embodiment),
@@ -220,15 +221,6 @@ class LeRobotVectorEnv(WorldModelVectorEnv):
         self._read(np.array(new, np.int64))
         infos = {"frames": self._frames.copy(), "is_success": self._success.copy()}
         return self._seen(), rewards, self._success.copy(), self._truncated.copy(), infos
-
-    def get_attr(self, name: str) -> tuple[Any, ...]:
-        """Return an attribute for each environment, as gymnasium's other vectors do."""
-        return (getattr(self, name),) * self.num_envs
-
-    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Return what a method gives for each environment, or an attribute."""
-        value = getattr(self, name)
-        return tuple(value(*args, **kwargs)) if callable(value) else (value,) * self.num_envs
 
     def _read(self, rows: Ints) -> None:
         """Read the states of environments off their newest images."""
