@@ -8,7 +8,6 @@ H×W pixels, A action dims, K = stride * A values of a chunk.
 import math
 import time
 from collections import deque
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -100,10 +99,7 @@ class Session:
         self.sample(sampling)
         self._begin(number, scene)
         self.row = world.open(robot.embodiment.id, *self._history())
-        with ExitStack() as undo:
-            undo.callback(world.close, self.row)
-            self._set_start()
-            undo.pop_all()
+        self._set_start()
 
     def sample(self, sampling: Decoding) -> None:
         """Go on with another sampling; the meter of uncertainty is that of such frames."""

@@ -152,15 +152,6 @@ def test_what_truly_happens_is_shown_in_the_size_of_the_models_images(size: int)
     assert session.start.psnr is not None
 
 
-def test_a_session_that_cannot_begin_leaves_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
-    (robot,) = lab_robots("mover_04").values()
-    world = TrueWorld()
-    monkeypatch.setattr(world, "image", lambda row: np.zeros((3, 3, 3), np.uint8))
-    with pytest.raises(UsageError, match="images must both be"):
-        Session("s", robot, 0, robot.scene(0), world, Decoding(2, 0.0))
-    assert not world.rows
-
-
 @pytest.fixture
 def shards(
     toy_arm: Embodiment, toy_recording: Path, block_tokenizer: BlockTokenizer, tmp_path: Path
