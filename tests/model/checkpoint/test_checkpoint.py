@@ -28,16 +28,9 @@ from hma_model.checkpoint.folder import (
 from hma_model.hub import publish as hub
 from hma_model.network.model import HMA
 from tests.hostile import Edit, cut, flip, swap, values, whole
-from tests.model.robots import CONFIG, SPEC, edit_card, make_model, save, yaml
+from tests.hub_state import ROBOTS
+from tests.model.robots import CONFIG, SPEC, make_model, save, yaml
 from tests.model.robots import stats as stats_of
-
-ROBOTS = {"arm": 2, "hand.v2": 3}
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    save(tmp_path / "model", ROBOTS)
-    return tmp_path / "model"
 
 
 def test_the_layout_is_the_contracts(folder):
@@ -64,7 +57,7 @@ def test_saving_a_loaded_model_gives_the_same_files(folder, tmp_path):
 
 
 def test_loading_one_embodiment_reads_no_other(folder):
-    for path in (folder / "embodiments/hand.v2").iterdir():
+    for path in (folder / "embodiments/hand").iterdir():
         path.write_bytes(b"not what it should be")
     assert list(checkpoint.load(folder, ["arm"]).embodiments) == ["arm"]
 
@@ -136,16 +129,6 @@ def test_a_missing_folder_and_an_empty_one_say_so(tmp_path):
         checkpoint.load(tmp_path / "nothing")
     with pytest.raises(CheckpointError, match=r"has no config\.json"):
         checkpoint.load(tmp_path)
-
-
-def test_metrics_of_the_card_are_in_the_readme(folder):
-    edit_card(folder, "arm", metrics={"psnr": 21.25})
-    assert "psnr 21.25" in (folder / "README.md").read_text()
-    checkpoint.load(folder)
-
-
-def test_the_config_comes_back(folder):
-    assert Checkpoint.open(folder).config == CONFIG
 
 
 @pytest.fixture
@@ -269,16 +252,6 @@ HOSTILE: dict[str, tuple[str, Edit, str]] = {  # the file, what is done to it, a
     "a bit of the head": (HEAD, flip(), r"head\.safetensors: is not the file that card\.json names"),
     "no head": (HEAD, Path.unlink, r"head\.safetensors.*again"),
     "a bit of the stem": (STEM_FILE, flip(), r"stem\.safetensors: is not the file that card\.json names"),
-    "a bit of the stem's header": (
-        STEM_FILE,
-        flip(12),
-        r"stem\.safetensors: is not a complete safetensors file",
-    ),
-    "a bit of the header's length": (
-        STEM_FILE,
-        flip(6),
-        r"stem\.safetensors: is not a complete safetensors file",
-    ),
     "a stem cut short": (STEM_FILE, cut(-100), r"stem\.safetensors: is not a complete safetensors file"),
     "the stem of another trunk": (
         STEM_FILE,

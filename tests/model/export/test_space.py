@@ -122,6 +122,9 @@ def test_an_export_with_files_of_the_user_is_not_replaced(name: str, page: Path,
     (page / name).write_text("mine")
     with pytest.raises(OutputError, match=f"not of the export: {name} — .*move them out"):
         export(page)
+    (page / "manifest.json").unlink()
+    with pytest.raises(OutputError, match="holds something else than an export"):
+        export(page)
     assert (page / name).read_text() == "mine"
 
 

@@ -15,7 +15,6 @@ from hma_model.checkpoint.folder import BUNDLED, Checkpoint
 from hma_model.checkpoint.io import record_evaluation
 from hma_model.cli import main
 from hma_model.play.holding import MEASURED, Holding, holdings
-from tests.hostile import flip
 from tests.hub_server import Hub
 from tests.hub_state import REPO, ROBOTS
 from tests.model.robots import save
@@ -66,14 +65,6 @@ def test_a_folder_of_the_bundled_models_name_is_played_alone(tmp_path, served, m
     assert main(["play", "--no-browser"]) == 0
     (([part], name, *_),) = served
     assert name == "embedded" and "pusht_fast" not in part.robots
-
-
-def test_a_damaged_trunk_is_refused(tmp_path, served, image, capsys) -> None:
-    save(tmp_path / "model", {"arm": 2})
-    trunk = tmp_path / "model/trunk.safetensors"
-    flip(-9)(trunk)
-    assert main(["play", str(tmp_path / "model"), "--prompt", image, "--no-browser"]) == 1
-    assert "is another trunk than config.json names — pull" in capsys.readouterr().err and not served
 
 
 @pytest.mark.slow

@@ -15,14 +15,13 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.verify import verify
 from hma_data.tokenizers.base import get_tokenizer
-from hma_model.checkpoint import io as checkpoint
 from hma_model.config import HMAConfig
 from hma_model.generation.decode import decode
 from hma_model.network.model import HMA
 from hma_model.policies.acting import Follower
 from hma_model.policies.arenas import Scenes, TrueArena
 from hma_model.policies.planning import Cost
-from hma_model.simulate import World, WorldModelEnv, load_world, starting_window
+from hma_model.simulate import World, load_world, starting_window
 from hma_model.synthetic.augment import Augmentation, augment
 from tests.data import cameras as three
 from tests.model.network.test_unet import COLORS, PIXELS
@@ -241,19 +240,6 @@ def colored() -> World:
     spec = palette.spec
     values = {**COLORS, "grid": spec.grid, "factored": spec.factored, "tokenizer": spec.to_json()}
     return World(_of_robot(HMA(HMAConfig(**values)), family.embodiment(ROBOT), False), palette)
-
-
-def test_an_environment_steps_and_resets(world: World, tmp_path: Path) -> None:
-    yaml = family.embodiment(ROBOT).to_yaml()
-    space = world.model.embodiments[ROBOT]
-    stats = {ROBOT: {"action": {"mean": list(space.mean), "std": list(space.std)}}}
-    checkpoint.save(world.model, tmp_path / "model", embodiment_yaml={ROBOT: yaml}, stats=stats, cards={})
-    arena = TrueArena(Scenes.of(world, ROBOT, 1, 0), 64)
-    begin = {"frames": arena.prompts[0].frames, "chunks": arena.prompts[0].chunks}
-    env = WorldModelEnv(tmp_path / "model", embodiment=ROBOT, prompt=begin, horizon=3)
-    first, _ = env.reset(seed=0)
-    image, *_ = env.step(env.action_space.sample())
-    assert np.array_equal(image, first)  # untrained, it repeats the frame
 
 
 def test_stored_pixels_of_a_prompt_are_shown_as_images(world: World) -> None:
