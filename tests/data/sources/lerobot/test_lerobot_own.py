@@ -25,7 +25,7 @@ from hma_data.storage.yaml_io import parse_yaml
 pytestmark = pytest.mark.slow  # of the import of lerobot, and of encoding AV1
 
 FPS, HEIGHT, WIDTH = 10, 64, 96
-LENGTHS = (12, 9, 15, 2, 11)
+LENGTHS = (7, 5, 9, 2, 6)
 TASKS = ("push the block", "größer als 3 → weiter")
 CAM, SIDE, STILL = (f"observation.images.{name}" for name in ("cam", "side", "still"))
 SIDES = ["height", "width", "channels"]
@@ -109,7 +109,7 @@ def encoder(codec: str) -> dict[str, Any]:
     return {"rgb_encoder": RGBEncoderConfig(vcodec={"av1": "libsvtav1"}.get(codec, codec))}
 
 
-@pytest.fixture(scope="module", params=["av1 many files", "av1 one file", "h264 one file", "h264 many files"])
+@pytest.fixture(scope="module", params=["av1 many files", "h264 one file"])
 def written(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     codec, _, files = request.param.partition(" ")
     settle = many_files if files == "many files" else lambda writer: None
@@ -210,7 +210,7 @@ def test_episodes_deleted_by_lerobot_leave_the_others_equal(tmp_path: Path) -> N
     delete_episodes(theirs(root), [1, 3], output_dir=tmp_path / "less", repo_id="team/less")
     robot, source = arm(cameras=[{"name": "cam", "key": CAM}], state=None), open_source("lerobot")
     refs = source.index(str(tmp_path / "less"), robot)
-    assert [ref.frames for ref in refs] == [12, 15, 11]
+    assert [ref.frames for ref in refs] == [7, 9, 6]
     kept, at = list(theirs(tmp_path / "less")), 0
     for ref, original in zip(refs, (0, 2, 4), strict=True):
         episode = source.read(str(tmp_path / "less"), ref.id, robot)
@@ -322,7 +322,7 @@ def test_stamps_that_drift_are_found_and_pairing_by_index_reads_them(apart: Path
     drifting = as_v21(apart, tmp_path / "cloth", row_hz=9.15)
     source = open_source("lerobot")
     cameras = [{"name": "cam", "key": CAM}]
-    with pytest.raises(EpisodeError, match=r"both count 12: if row i belongs to frame i.*pairing: index"):
+    with pytest.raises(EpisodeError, match=r"both count 7: if row i belongs to frame i.*pairing: index"):
         source.read(str(drifting), "episode_000000", arm(cameras=cameras, state=None))
     (told,) = (one for one in examine(str(drifting)) if one.check == "skew")
     assert "pairing: index" in told.remedy and told.severity == "warn"
