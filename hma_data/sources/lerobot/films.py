@@ -67,68 +67,49 @@ def fit(clock: Floats, spans: Sequence[Span], fps: float) -> Fit:
     # Stamps are believed wherever they fit. A video that begins later or earlier than its metadata says is
     # moved as a whole, but only if every episode then has exactly its number of frames.
     for shift in dict.fromkeys((0.0, float(clock[0] - starts[0]), float(clock[0]))):
-        parts = _Parts(clock - shift, spans, starts, ends, fps)
-        if parts.fit_by_stamps() if shift == 0.0 else parts.fit_by_counts():
-            return Fit(shift, unused=parts.unused())
+        unused = _unused(clock - shift, spans, starts, ends, fps, is_moved=shift != 0.0)
+        if unused is not None:
+            return Fit(shift, unused=unused)
     return Fit(fault=_misfit(clock, spans), remedy=_REMEDY)
 
 
-class _Parts:
-    """The frames of a video that lie in the parts of its episodes.
+def _unused(
+    clock: Floats, spans: Sequence[Span], starts: Floats, ends: Floats, fps: float, is_moved: bool
+) -> dict[int, int] | None:
+    """Count the frames between an episode's last row and the next episode; None where rows and frames differ.
 
     Args:
         clock: (N,) seconds of the frames, on the clock of the metadata.
         spans: (E,) the episodes' parts by their start.
         starts, ends: (E,) seconds; a part ends one period after its last row.
+        is_moved: whether `clock` differs from the file's stamps; then only equal counts are believed.
+
+    Returns:
+        Episode index -> frames, where there are any.
     """
-
-    def __init__(
-        self, clock: Floats, spans: Sequence[Span], starts: Floats, ends: Floats, fps: float
-    ) -> None:
-        self._clock, self._spans, self._fps = clock, spans, fps
-        self._rows = np.array([span.rows for span in spans])
-        first = np.searchsorted(clock, starts - 0.5 / fps)
-        last = np.searchsorted(clock, ends - 0.5 / fps)
-        self._counts = last - first
-        self._after = np.append(first[1:], len(clock)) - last  # frames from an episode's end to the next
-        begins = clock[np.minimum(first, len(clock) - 1)]
-        self._is_aligned = bool(np.abs(begins - starts).min() <= TIME_TOLERANCE / fps)
-
-    def fit_by_stamps(self) -> bool:
-        """Check whether the stamps tell the frame of every row that has one."""
-        if not self._is_aligned:
-            return False
-        if self._spans[-1].stop is None:  # a video of one episode: its rows are compared one by one later
-            return len(self._clock) == self._rows.sum()
-        # A frame that was dropped leaves a hole in the stamps. Without one, it is unknown where it was.
-        missing = np.maximum(self._rows - self._counts, 0).sum()
-        intervals = np.diff(self._clock) * self._fps
-        holes = np.rint(intervals[intervals > HOLE] - 1).sum()
-        return bool(missing <= holes) and self._is_tail_explained()
-
-    def fit_by_counts(self) -> bool:
-        """Check whether each episode has exactly its number of frames."""
-        exact = bool((self._counts == self._rows).all()) and self._is_aligned
-        if self._spans[-1].stop is None:
-            return len(self._clock) == self._rows.sum() and self._is_aligned
-        return exact and self._is_tail_explained()
-
-    def _is_tail_explained(self) -> bool:
-        """Check whether the frames after the last episode can belong after it.
-
-        A removed episode leaves as many as an episode has, and a recorder may add some to each. Otherwise
-        they slipped in anywhere, and moved all that follows.
-        """
-        tail = self._after[-1]
-        # An episode without rows would explain any number of frames.
-        shortest = self._rows.min(where=self._rows > 0, initial=len(self._clock) + 1)
-        is_usual = len(self._after) > 1 and bool((self._after == tail).all())
-        return bool(tail <= 0 or tail >= shortest or is_usual)
-
-    def unused(self) -> dict[int, int]:
-        """Return episode index -> frames between its last row and the next episode, where there are any."""
-        pairs = zip(self._spans, self._after.tolist(), strict=True)
-        return {span.index: count for span, count in pairs if count > 0}
+    rows = np.array([span.rows for span in spans])
+    first, last = (np.searchsorted(clock, times - 0.5 / fps) for times in (starts, ends))
+    after = np.append(first[1:], len(clock)) - last
+    begins = clock[np.minimum(first, len(clock) - 1)]
+    fits = bool(np.abs(begins - starts).min() <= TIME_TOLERANCE / fps)
+    if spans[-1].stop is None:  # a video of one episode: its rows are compared one by one later
+        fits = fits and len(clock) == rows.sum()
+    else:
+        if is_moved:
+            fits = fits and bool((last - first == rows).all())
+        else:
+            # A frame that was dropped leaves a hole in the stamps. Without one, it is unknown where it was.
+            missing = np.maximum(rows - (last - first), 0).sum()
+            intervals = np.diff(clock) * fps
+            fits = fits and missing <= np.rint(intervals[intervals > HOLE] - 1).sum()
+        # A removed episode leaves as many frames after the last one as an episode has, and a recorder may add
+        # some to each. Otherwise they slipped in anywhere, and moved all that follows. An episode without
+        # rows would explain any number of frames.
+        shortest = rows.min(where=rows > 0, initial=len(clock) + 1)
+        is_usual = len(after) > 1 and (after == after[-1]).all()
+        fits = fits and bool(after[-1] <= 0 or after[-1] >= shortest or is_usual)
+    counts = zip(spans, after.tolist(), strict=True)
+    return {span.index: count for span, count in counts if count > 0} if fits else None
 
 
 def _misfit(clock: Floats, spans: Sequence[Span]) -> str:
