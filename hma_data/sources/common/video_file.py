@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from hma_data.arrays import Floats, Images, Indices, Ints
-from hma_data.episodes.episode import OneByOne, all_of, of_one_size
+from hma_data.episodes.episode import OneByOne, of_one_size
 from hma_data.episodes.images import MAX_PIXELS, FrameToRGB, refuse_hdr
 from hma_data.errors import EpisodeError
 from hma_data.storage.kinds import unreadable
@@ -86,7 +86,7 @@ def frame_table(path: Path) -> FrameTable:
 @lru_cache(maxsize=64)  # LeRobotDataset v3 keeps hundreds of episodes in one file
 def _cached_table(path: str, size: int, changed: int) -> FrameTable:
     with opened(path) as (container, stream):
-        size_px = decoded_size(container, stream)
+        width, height = decoded_size(container, stream)
         refuse_hdr(stream.codec_context, path)
     with opened(path) as (container, stream):
         shown: list[int] = []
@@ -106,42 +106,28 @@ def _cached_table(path: str, size: int, changed: int) -> FrameTable:
             if not packet.is_discard:  # an edit list may hide frames, which are decoded but not shown
                 shown.append(stamp)
         timeless = "avi" in container.format.name or delays <= {0, None}
-        counted = bool(stream.codec_context.has_b_frames) and timeless and len(delays) == 1
-        return _table(path, (size, changed), stream, shown, keyframes, counted, size_px)
+        stamps = np.sort(np.array(shown, np.int64))
+        if not len(stamps) or not keyframes:
+            raise EpisodeError(path, "has no frames")
+        if (np.diff(stamps) == 0).any():
+            raise EpisodeError(path, f"has two frames at {stamps[np.diff(stamps, append=-1) == 0][0]} ticks")
+        starts = np.array(sorted(keyframes), np.int64)  # (K, 2): shown at, seek to
+        order = np.maximum(np.searchsorted(starts[:, 0], stamps, side="right") - 1, 0)
+        return FrameTable(
+            times=stamps.astype(np.float64) * np.float64(stream.time_base),
+            stamps=stamps,
+            keys=np.searchsorted(stamps, starts[order, 0]),
+            seek_stamps=starts[order, 1],
+            width=width,
+            height=height,
+            codec=stream.codec.canonical_name,
+            hz=float(stream.average_rate) if stream.average_rate else None,
+            state=(size, changed),
+            counted=bool(stream.codec_context.has_b_frames) and timeless and len(delays) == 1,
+        )
 
 
-def _table(
-    path: str,
-    state: tuple[int, int],
-    stream: Any,
-    shown: list[int],
-    keyframes: list[tuple[int, int]],
-    counted: bool,
-    size_px: tuple[int, int],
-) -> FrameTable:
-    stamps = np.sort(np.array(shown, np.int64))
-    if not len(stamps) or not keyframes:
-        raise EpisodeError(path, "has no frames")
-    if (np.diff(stamps) == 0).any():
-        raise EpisodeError(path, f"has two frames at {stamps[np.diff(stamps, append=-1) == 0][0]} ticks")
-    starts = np.array(sorted(keyframes), np.int64)  # (K, 2): shown at, seek to
-    order = np.maximum(np.searchsorted(starts[:, 0], stamps, side="right") - 1, 0)
-    rate = stream.average_rate
-    return FrameTable(
-        times=stamps.astype(np.float64) * np.float64(stream.time_base),
-        stamps=stamps,
-        keys=np.searchsorted(stamps, starts[order, 0]),
-        seek_stamps=starts[order, 1],
-        width=size_px[0],
-        height=size_px[1],
-        codec=stream.codec.canonical_name,
-        hz=float(rate) if rate else None,
-        state=state,
-        counted=counted,
-    )
-
-
-class VideoFile:
+class VideoFile(OneByOne):
     """A video file as an array of frames; it opens on first use, and again after a fork."""
 
     def __init__(self, path: Path) -> None:
@@ -164,22 +150,12 @@ class VideoFile:
         """Return (N,) seconds by the file's own clock."""
         return self.table.times
 
-    def frames(self, indices: Indices) -> Images:
-        """Return the images (n, H, W, 3) RGB uint8 of those frames; rising indices are fastest.
+    def each(self, indices: Indices, least: int = 0) -> Iterator[Images]:
+        """Yield the image (H, W, 3) RGB uint8 of each of those frames; rising indices are fastest.
 
         Raises:
             EpisodeError: a frame cannot be decoded, or the frames change size.
-            IndexError: an index lies outside the video.
         """
-        wanted = np.asarray(indices, np.int64).reshape(-1)
-        if len(wanted) and not 0 <= wanted.min() <= wanted.max() < len(self):
-            raise IndexError(
-                f"{self.path} has {len(self)} frames, asked for {wanted.min()} to {wanted.max()}"
-            )
-        return all_of(self, wanted)
-
-    def each(self, indices: Indices, least: int = 0) -> Iterator[Images]:
-        """Yield the image (H, W, 3) of each of those frames; rising indices are fastest. See OneByOne."""
         with _explained(str(self.path)):
             yield from of_one_size(map(self._image, map(int, indices)), str(self.path))
 

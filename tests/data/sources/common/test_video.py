@@ -81,11 +81,6 @@ def test_no_indices_give_no_pictures(video: Path) -> None:
     assert VideoFile(video).frames([]).shape == (0, 1, 1, 3)  # as of every stream
 
 
-def test_an_index_outside_is_an_index_error(video: Path) -> None:
-    with pytest.raises(IndexError, match="40 frames"):
-        VideoFile(video).frames([LENGTH])
-
-
 @pytest.mark.parametrize(
     ("matrix", "shown"),
     [
