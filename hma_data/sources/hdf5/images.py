@@ -19,8 +19,7 @@ from hma_data.sources.hdf5.file import EpisodeFinder, EpisodeGroup, dataset, exp
 
 PIXELS = {"0-1": 1.0, "0-255": 255.0, "0-65535": 65535.0}
 LEAST_SIDE = 16  # pixels: a smaller array of other numbers than uint8 is not taken for images
-NO_TIMES: Floats = np.zeros(0)
-_CHANNELS = (1, 3, 4)
+CHANNELS = (1, 3, 4)
 _SLACK = 1e-3  # share of the range by which values may exceed it, as resizing can cause
 
 
@@ -31,7 +30,7 @@ def image_kind(found: h5py.Dataset, layout: Hdf5Layout | None = None) -> str | N
         return None
     if found.dtype == np.uint8 or (layout and layout.pixels and found.dtype.kind in "fiu"):
         channels_first = layout.axes == "TCHW" if layout and layout.axes else shape[1:2] in ((1,), (3,))
-        if len(shape) == 3 or (len(shape) == 4 and (shape[3] in _CHANNELS or channels_first)):
+        if len(shape) == 3 or (len(shape) == 4 and (shape[3] in CHANNELS or channels_first)):
             return "raw"
     padded = found.dtype == np.uint8 and len(shape) == 2
     one_a_row = len(shape) == 1 and (found.dtype.kind in "SV" or _is_bytes(found.dtype))
@@ -59,11 +58,11 @@ def pixels_of(found: h5py.Dataset, indices: Sequence[int]) -> str:
     return next((name for name, most in PIXELS.items() if high <= most and not (whole and most == 1)), "")
 
 
-def as_rgb(images: Images, axes: str | None = None) -> Images:
-    """Convert (n, H, W), (n, H, W, 1|3|4) or (n, 1|3|4, H, W) to (n, H, W, 3)."""
-    if images.ndim == 3:
+def as_rgb(images: Images, axes: str) -> Images:
+    """Convert (n, H, W), (n, H, W, 1|3|4) or (n, 1|3|4, H, W) to (n, H, W, 3); see `axes_of`."""
+    if axes == "THW":
         images = images[..., None]
-    elif axes == "TCHW" or (axes is None and images.shape[3] not in _CHANNELS):
+    elif axes == "TCHW":
         images = images.transpose(0, 2, 3, 1)
     if images.shape[3] == 1:
         images = np.repeat(images, 3, axis=3)
@@ -81,7 +80,7 @@ def axes_of(shape: tuple[int, ...], layout: Hdf5Layout, where: str) -> str:
     """Return THW, THWC or TCHW: from the YAML, else by the axis whose size is a number of channels."""
     if len(shape) == 3:
         return "THW"
-    last, first = shape[3] in _CHANNELS, shape[1] in _CHANNELS
+    last, first = shape[3] in CHANNELS, shape[1] in CHANNELS
     if layout.axes:
         if not (first if layout.axes == "TCHW" else last):
             fault = f"holds images {shape[1:]}, source.layout.axes says {layout.axes}"
@@ -114,7 +113,7 @@ def _is_bytes(dtype: np.dtype[Any]) -> bool:
     return np.dtype(inner).kind in "iu" and np.dtype(inner).itemsize == 1
 
 
-def remedy_of(found: h5py.Dataset, layout: Hdf5Layout) -> str:
+def _remedy(found: h5py.Dataset, layout: Hdf5Layout) -> str:
     shape: tuple[int, ...] = found.shape or ()
     numbers = found.dtype.kind in "fiu" and found.dtype != np.uint8
     if numbers and len(shape) == 4 and 3 in (shape[1], shape[3]) and not layout.pixels:
@@ -129,41 +128,31 @@ class ImageRows:
         finder: of the source; the dataset is kept open in its files.
         place, key: the episode, and the dataset in it.
         layout: of the source, from the YAML.
-        times: (T,) seconds of the frames; rows after the last one are not used.
 
     Raises:
         EpisodeError: the dataset is missing, or holds no colour images.
     """
 
-    def __init__(
-        self,
-        finder: EpisodeFinder,
-        place: EpisodeGroup,
-        key: str,
-        layout: Hdf5Layout,
-        times: Floats = NO_TIMES,
-    ) -> None:
-        self.timestamps = times
+    timestamps: Floats = np.zeros(0)  # (T,) seconds, set by who knows them; rows after the last are not used
+
+    def __init__(self, finder: EpisodeFinder, place: EpisodeGroup, key: str, layout: Hdf5Layout) -> None:
         self._finder, self._place = finder, place
         self._key, self._layout, self._where = key, layout, f"{place} {key}"
         found = dataset(finder.group(place), key, str(place))
         self.rows = len(found)
-        self._kind = image_kind(found, layout)
-        if self._kind is None:
+        kind = image_kind(found, layout)
+        if kind is None:
             fault = f"{key!r} holds {found.shape} {found.dtype}, not colour images"
-            raise EpisodeError(place, fault, remedy_of(found, layout))
-        if self._kind == "raw":
-            axes_of(found.shape, layout, self._where)
+            raise EpisodeError(place, fault, _remedy(found, layout))
+        self._axes = axes_of(found.shape, layout, self._where) if kind == "raw" else None
 
     def each(self, indices: Indices, least: int = 0) -> Images | list[Images]:
         """Return the images of those frames, which may differ in size where each is encoded."""
         with explained(self._place):
             group, where = self._finder.group(self._place), str(self._place)
             found = rows(self._finder.files.cached(self._place.file, group, self._key, where), indices)
-        if self._kind == "raw":
-            return as_rgb(
-                as_bytes(found, self._layout, self._where), axes_of(found.shape, self._layout, self._where)
-            )
+        if self._axes:
+            return as_rgb(as_bytes(found, self._layout, self._where), self._axes)
         return [
             decode_image(encoded(row), f"{self._where}[{index}]", least)
             for row, index in zip(found, indices, strict=True)

@@ -38,7 +38,7 @@ from hma_data.sources.hdf5.file import (
     text,
     walk,
 )
-from hma_data.sources.hdf5.images import ImageRows, as_rgb, encoded, image_kind, pixels_of
+from hma_data.sources.hdf5.images import CHANNELS, ImageRows, encoded, image_kind, pixels_of
 from hma_data.sources.hdf5.videos import is_video, video_keys, videos_beside
 
 _RATES = ("control_freq", "control_frequency", "frequency_hz", "frequency", "fps", "hz", "rate")
@@ -264,22 +264,21 @@ def _hertz(value: Any) -> float | None:
 def _keys(group: h5py.Group, place: EpisodeGroup, pixels: Container[str]) -> Iterator[KeyInfo]:
     for key, item in walk(group):
         count = item.shape[0] if item.shape else None
-        kind, shape, codec = _kind(item, f"{place} {key}")
-        if key in pixels:
-            sides = item.shape[1:]
-            kind, shape, codec = "camera", sides if sides[2] == 3 else (*sides[1:], 3), "raw"
+        kind, shape, codec = _kind(item, f"{place} {key}", key in pixels)
         is_rate = count == 1 and key.rsplit("/", 1)[-1] in _RATES
         kind = "other" if is_rate or key in _BESIDE else kind
         yield KeyInfo(key, kind, shape, str(item.dtype), codec=codec, count=count)
 
 
-def _kind(item: h5py.Dataset, where: str) -> tuple[str, tuple[int, ...], str | None]:
-    """Return kind, shape of one sample, and codec."""
+def _kind(item: h5py.Dataset, where: str, has_colours: bool) -> tuple[str, tuple[int, ...], str | None]:
+    """Return kind, shape of one sample, and codec; `has_colours` tells images of other numbers than uint8."""
     shape = item.shape or ()
     images = image_kind(item) if shape and shape[0] and is_plausible(item) else None
-    if images == "raw":
-        shape = as_rgb(rows(item, [0])).shape[1:]
-        return "camera", (*shape[:2], 1) if _is_grey(item.shape) else shape, "raw"
+    if has_colours or images == "raw":
+        is_last = len(shape) == 3 or shape[3] in CHANNELS
+        sides = shape[1:3] if is_last else shape[2:]
+        channels = 1 if len(shape) == 3 else shape[3 if is_last else 1]
+        return "camera", (*sides, 1 if channels == 1 else 3), "raw"
     if images == "encoded":
         first = rows(item, [0])[0]
         if codec := image_codec(encoded(first)):
@@ -290,8 +289,3 @@ def _kind(item: h5py.Dataset, where: str) -> tuple[str, tuple[int, ...], str | N
     if item.dtype.kind in "fiub" and 1 <= len(shape) <= 3:
         return "vector", shape[1:] or (1,), None
     return "other", shape[1:], None
-
-
-def _is_grey(shape: tuple[int, ...]) -> bool:
-    """Check whether raw images (T, H, W), (T, H, W, C) or (T, C, H, W) have one channel."""
-    return len(shape) == 3 or (shape[3] if shape[3] in (1, 3, 4) else shape[1]) == 1

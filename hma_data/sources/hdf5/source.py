@@ -150,7 +150,7 @@ class Hdf5Source:
                     video = VideoFile(video_path(place.file, camera, layout))
                     cameras[camera.name] = FilmRows(video, times)
                 else:
-                    cameras[camera.name] = self._images(place, group, camera.key, layout, times)
+                    cameras[camera.name] = self._images(place, group, camera.key, layout)
                 check(camera.key, cameras[camera.name].rows, layout.frames_missing * is_video(camera.key))
             # Rows beyond the stated number are empty buffers; a video beside the file has none.
             length = min(recorded.rows, *(images.rows for images in cameras.values()))
@@ -171,11 +171,9 @@ class Hdf5Source:
                 metadata={"flags": {"rows_without_record": unused}},
             )
 
-    def _images(
-        self, place: EpisodeGroup, group: h5py.Group, key: str, layout: Hdf5Layout, times: Floats
-    ) -> ImageRows:
+    def _images(self, place: EpisodeGroup, group: h5py.Group, key: str, layout: Hdf5Layout) -> ImageRows:
         try:
-            return ImageRows(self._finder, place, key, layout, times)
+            return ImageRows(self._finder, place, key, layout)
         except EpisodeError as fault:
             if "states" in group and not any(image_kind(item) for _, item in walk(group)):
                 said = "holds a simulator's states and no images"
