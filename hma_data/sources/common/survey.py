@@ -8,9 +8,10 @@ T samples of a key in an episode, A values a sample.
 """
 
 import re
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -92,14 +93,6 @@ class _Numbers:
     last: str = ""  # the last episode that has such a value
 
 
-@dataclass
-class _Times:
-    """The times of one key over the episodes."""
-
-    met: dict[str, StreamTimes] = field(default_factory=dict)
-    skew: tuple[float, float, float] | None = None
-
-
 class Survey:
     """The collected results of the sampled episodes.
 
@@ -119,7 +112,8 @@ class Survey:
         self.made: set[str] = {"readable"}
         self._faults: dict[tuple[str, str], HMAError] = {}  # (episode, key or "") -> why
         self._numbers: dict[str, _Numbers] = {}
-        self._times: dict[str, _Times] = {}
+        self._times: defaultdict[str, dict[str, StreamTimes]] = defaultdict(dict)  # key -> episode -> times
+        self._skew: dict[str, tuple[float, float, float] | None] = {}  # of the last episode
         self._found: list[tuple[str, Finding]] = []  # with the name of the episode, or ""
         self._shown: dict[str, str] = {}  # camera -> the episode last looked at
 
@@ -260,8 +254,7 @@ class Survey:
         `back_remedy` is what helps where they go back.
         """
         self.made |= {"repeated", "back", "gaps"} | ({"frames"} if camera else set())
-        held = self._times.setdefault(key, _Times())
-        found = held.met[name] = checks.measure(seconds)
+        found = self._times[key][name] = checks.measure(seconds)
         for one in checks.time_findings(key, found, camera, "" if self.alone else name):
             remedy = back_remedy if one.check == "back" else one.remedy
             if one.check == "gaps" and camera and self.by_field:  # a bag may be divided there
@@ -272,9 +265,8 @@ class Survey:
     def skew(self, key: str, found: tuple[float, float, float] | None, period_s: float) -> None:
         """Note how far a stream is from the primary stream's frames; `period_s` is their median interval."""
         self.made.add("skew")
-        held = self._times[key]
-        held.skew = found
-        own = max((times.period_s for times in held.met.values()), default=0.0)
+        self._skew[key] = found
+        own = max((times.period_s for times in self._times[key].values()), default=0.0)
         if found and found[1] > 1e3 * max(period_s, own):
             said = f"{key}: p95 {found[1]:.1f} ms from the first camera's frames, max {found[2]:.1f} ms"
             numbers = dict(zip(("p50_ms", "p95_ms", "max_ms"), found, strict=True))
@@ -285,8 +277,7 @@ class Survey:
 
     def rate(self, key: str) -> float | None:
         """Return the first rate in Hz that was measured by the clock of a key."""
-        held = self._times.get(key)
-        return next((times.hz for times in held.met.values() if times.hz), None) if held else None
+        return next((times.hz for times in self._times[key].values() if times.hz), None)
 
     def inspection(
         self,
@@ -316,7 +307,8 @@ class Survey:
     def key(self, info: KeyInfo) -> KeyInfo:
         """Return the key with what was measured of it."""
         held, look = self._numbers.get(info.key), self.looks.get(info.key)
-        times = self._times.get(info.topic.name if info.topic else info.key)
+        clock = info.topic.name if info.topic else info.key
+        times = self._times[clock].values()
         if held is not None:
             still, ends = _still(held), _finite(held)
             info = replace(
@@ -326,15 +318,15 @@ class Survey:
                 low=float(ends.min()) if len(ends) else None,
                 high=float(ends.max()) if len(ends) else None,
             )
-        if times is not None and times.met:
-            rates = [one.hz for one in times.met.values() if one.hz]
-            jitters = [one.jitter_ms for one in times.met.values() if one.jitter_ms is not None]
+        if times:
+            rates = [one.hz for one in times if one.hz]
+            jitters = [one.jitter_ms for one in times if one.jitter_ms is not None]
             stated = info.hz and any(abs(one / info.hz - 1) <= checks.DRIFT for one in rates)
             info = replace(
                 info,
                 hz=info.hz if stated or not rates else float(np.median(rates)),
                 jitter_ms=float(np.median(jitters)) if jitters else info.jitter_ms,
-                skew_ms=times.skew,
+                skew_ms=self._skew.get(clock),
             )
         if look is not None:
             info = replace(info, swapped=look.swapped()[0] or None)
