@@ -378,7 +378,9 @@ def _keys(meta: Metadata) -> tuple[KeyInfo, ...]:
 
 
 def _codec(meta: Metadata, key: str) -> str | None:
-    """Return the codec of the first episode; None where it cannot be read."""
+    """Return the codec of the first episode; None where it cannot be read, or would have to be fetched."""
+    if meta.folder.repo:
+        return None
     index = next(iter(meta.episodes))
     try:
         if meta.features[key].dtype == "video":

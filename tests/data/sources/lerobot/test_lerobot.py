@@ -263,10 +263,11 @@ def hub(tmp_path: Path, folders: dict[str, Path], monkeypatch: pytest.MonkeyPatc
         yield server
 
 
-def test_only_metadata_is_fetched_to_list_episodes(hub: Hub) -> None:
+def test_only_metadata_is_fetched_to_list_and_inspect_episodes(hub: Hub) -> None:
     for name in ("two", "three"):
         refs = open_source("lerobot").index(f"hf://datasets/team/{name}", embodiment())
         assert [ref.frames for ref in refs] == list(HUB_LENGTHS)
+        assert open_source("lerobot").inspect(f"hf://datasets/team/{name}").lengths == HUB_LENGTHS
     assert hub.served() and all(path.startswith("meta/") for path in hub.served())
 
 
