@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from hma_data.errors import EpisodeError, HMAError
+from hma_data.errors import HMAError
 from hma_data.registry.components import HandsLayout
 from hma_data.sources.common.checks import Finding
 from hma_data.sources.common.inspection import Inspection, KeyInfo
@@ -112,10 +112,8 @@ def inspect_videos(uri: str, episodes: int) -> Inspection:
         survey.note(Finding("files", "info", said, f"for a robot's videos: {ROBOT_VIDEOS_PAGE}"))
     headers: dict[str, Header] = {}
     for name, video in videos.items():
-        try:
+        with survey.reading(name):
             headers[name] = header_of(video.path)
-        except EpisodeError as fault:
-            survey.fault(name, fault)
     chosen = survey.sample(list(headers), episodes)
     survey.made |= {"frames"} if chosen else set()
     for name in chosen:
@@ -157,26 +155,24 @@ def _hands_in(videos: dict[str, Video], chosen: list[str], survey: Survey) -> di
     """Return the shares of sampled frames with hands; note the sampled videos that show none."""
     detector = MediaPipeHands()
     survey.made.add("hands")
-    looked = 0
-    sides: Counter[str] = Counter()
+    every: list[list[str]] = []  # the sides of the hands in each frame
     for name in chosen:
-        try:
+        with survey.reading(name):
             file = VideoFile(videos[name].path)
             frames = sampled(len(file), FRAMES_PER_VIDEO)
             # The frames are far apart, so each is scanned alone and no hand is tracked between them.
             seen = [scan(name, file, detector, [index])["side"].to_pylist() for index in frames]
-        except EpisodeError as fault:
-            survey.fault(name, fault)
-            continue
-        looked += len(seen)
-        sides["left hand"] += sum("left" in each for each in seen)
-        sides["right hand"] += sum("right" in each for each in seen)
-        sides["both"] += sum(len(each) == 2 for each in seen)
-        if not any(seen):
-            said = f"{name}: no hand in {len(seen)} sampled frames"
-            survey.note(Finding("hands", "warn", said, key="video", numbers={"frames": len(seen)}))
+            every += seen
+            if not any(seen):
+                said = f"{name}: no hand in {len(seen)} sampled frames"
+                survey.note(Finding("hands", "warn", said, key="video", numbers={"frames": len(seen)}))
+    counts = {
+        "left hand": sum("left" in sides for sides in every),
+        "right hand": sum("right" in sides for sides in every),
+        "both": sum(len(sides) == 2 for sides in every),
+    }
     return {
-        f"frames with {side}": f"{sides[side] / looked:.0%} of {looked} sampled"
-        for side in ("left hand", "right hand", "both")
-        if looked
+        f"frames with {side}": f"{count / len(every):.0%} of {len(every)} sampled"
+        for side, count in counts.items()
+        if every
     }

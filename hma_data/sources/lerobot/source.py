@@ -278,10 +278,8 @@ class _Looking:
         """Return the episodes whose file is there; report the missing files as one finding."""
         paths = {}
         for index in self._indices:
-            try:
+            with self._survey.reading(episode_name(index)):
                 paths[index] = self._meta.video(index, key).path if key else self._meta.data_path(index)
-            except EpisodeError as fault:
-                self._survey.fault(episode_name(index), fault)
         distinct = list(dict.fromkeys(paths.values()))
         missing = [path for path in distinct if not (self._meta.folder.root / path).is_file()]
         if missing:
