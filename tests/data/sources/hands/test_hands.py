@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hma_data.conversion.job import convert
 from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError
 from hma_data.registry.components import HandsLayout
@@ -248,16 +247,6 @@ def test_a_grid_of_its_own_resamples_pictures_and_hands(folder: Path) -> None:
     shown = [number_of(p) for p in aligned.frames_at("primary", np.arange(len(aligned)))]
     np.testing.assert_allclose(aligned.actions, made.expected(np.arange(len(aligned)) // 2 + 1), atol=1e-6)
     assert set(shown) == set(range(LENGTH - 1)) and shown == sorted(shown)
-
-
-def test_a_conversion_makes_the_same_shards_twice(folder: Path, tmp_path: Path, block_tokenizer) -> None:
-    table = made.rows("a", LENGTH, lambda side, i: i != 14)
-    made.write_table(folder / "hands.parquet", table)
-    robot = made.hand_video("landmarks")
-    done = [convert(robot, str(folder), block_tokenizer, tmp_path / f"out{i}") for i in (0, 1)]
-    shards = [sorted((tmp_path / f"out{i}").glob("*/*.parquet")) for i in (0, 1)]
-    assert sum(split["episodes"] for split in done[0].manifest.splits.values()) == 2
-    assert [path.read_bytes() for path in shards[0]] == [path.read_bytes() for path in shards[1]]
 
 
 def test_the_human_embodiments_that_come_along_have_known_keys_and_layouts() -> None:

@@ -112,13 +112,14 @@ def laid_out(**layout: str) -> dict[str, Any]:
 
 
 TIMED = laid_out(timestamps="t")
-REF, OBJECT, LONG = h5py.ref_dtype, h5py.regionref_dtype, h5py.vlen_dtype(np.float64)
+REF, LONG = h5py.ref_dtype, h5py.vlen_dtype(np.float64)
+LINK = "data/demo_0: is damaged, or a link to what is not in this file"
 FAR, SMALL = "keeps its values in other files", np.zeros((T - 1, 2))
 IN, NOWHERE, AWAY = h5py.ExternalLink("secret.bin", "/in"), h5py.SoftLink("/nowhere"), h5py.SoftLink("/away")
 ACTIONS, SHORT = {"key": "actions", "dims": 3}, {"key": "short", "dims": 2}
 BOMB = {"key": "bomb", "dims": 1, "slice": [0, 1]}
 WIDE = {"shape": (T, 1 << 28), "dtype": "f8", "chunks": (1, 1 << 28), "compression": "gzip"}
-HUGE = [(10**12, H, W, 3), (10**12,), (T, 10**6, 10**6, 3), (10**9, 1)]
+HUGE = [(10**12, H, W, 3), (T, 10**6, 10**6, 3), (10**9, 1)]
 ONE: dict[str, Row] = {  # one demo is refused
     "no actions": (put("actions", data=np.zeros((0, 3))), "holds no rows, one per frame"),
     "one number": (put("actions", data=3.0), "holds no rows, one per frame"),
@@ -128,8 +129,8 @@ ONE: dict[str, Row] = {  # one demo is refused
     "one image more": (put(KEY, data=pictures(T + 1)), r"actions 9, .*image 10.*\.last_observation: drop"),
     "two more": (put(KEY, data=pictures(T + 2)), "actions 9, .*11", laid_out(last_observation="drop")),
     "images of references": (put(KEY, shape=(T,), dtype=REF), "not colour images"),
-    "images of regions": (put(KEY, shape=(T,), dtype=OBJECT), "not colour images"),
     "images of lists": (put(KEY, shape=(T,), dtype=LONG), "not colour images"),
+    "images of u2": (put(KEY, data=pictures().astype("u2")), r"not colour images.*layout\.pixels.*0-1"),
     "images of no height": (put(KEY, shape=(T, 0, W, 3), dtype="u1"), "not colour images"),
     "actions that are a type": (changed(a_type), "'actions' is a group or a type"),
     "states of a simulator": (changed(without_pictures), "states and no images.*dataset_states_to_obs"),
@@ -137,34 +138,20 @@ ONE: dict[str, Row] = {  # one demo is refused
     "a link through another file": (linked(KEY, h5py.SoftLink("/away/image")), FAR),
     "an external file": (put("actions", shape=(T, 3), dtype="f8", external=[("x", 0, T * 24)]), FAR),
     "a virtual dataset": (changed(virtual), FAR),
-    "a demo that is elsewhere": (linked("", IN), "demo_0: is damaged, or a link to what is not in this file"),
-    "a demo that is nowhere": (
-        linked("", NOWHERE),
-        "demo_0: is damaged, or a link to what is not in this file",
-    ),
-    "a demo by way of elsewhere": (
-        linked("", AWAY),
-        "demo_0: is damaged, or a link to what is not in this file",
-    ),
-    "a demo of another header": (of_another_header, "data/demo_0: is damaged, or a link to what is not"),
+    "a demo that is elsewhere": (linked("", IN), LINK),
+    "a demo that is nowhere": (linked("", NOWHERE), LINK),
+    "a demo by way of elsewhere": (linked("", AWAY), LINK),
+    "a demo of another header": (of_another_header, LINK),
     "a bomb of a picture": (put(KEY, data=np.array([bomb()] * T)), "cannot be decoded"),
     "an unknown compression": (changed(packed_in_another_way), "in a way that HDF5 alone does not know"),
     "another file cut short": (beside("cut.hdf5", cut(5000)), r"cut\.hdf5: cannot be read as HDF5"),
 }
 ONE |= {
-    f"images of {dtype}": (put(KEY, data=pictures().astype(dtype)), r"not colour images.*layout\.pixels.*0-1")
-    for dtype in ("f4", "u2", "i8")
-}
-ONE |= {
     f"images with {value}": (put(KEY, data=outside(value)), "pixels says 0-1", laid_out(pixels="0-1"))
-    for value in (200.0, -0.5, np.nan, np.inf)
+    for value in (200.0, np.nan)
 }
 ALL: dict[str, Row] = {  # no demo can be used
-    "no such key": (
-        untouched,
-        f"demo_0: has no 'obs/agentview'.*did you mean '{KEY}'",
-        sees("obs/agentview"),
-    ),
+    "no such key": (untouched, f"has no 'obs/agentview'.*did you mean '{KEY}'", sees("obs/agentview")),
     "a group": (untouched, f"'obs' is a group.*{KEY}", sees("obs")),
     "a link to itself": (linked("dones", h5py.SoftLink("/data/demo_0/dones")), "'dones'", sees("dones")),
     "another width": (untouched, "actions has 3 values, the embodiment says 7", acts(ACTIONS | {"dims": 7})),

@@ -117,37 +117,18 @@ def test_channels_may_come_first(tmp_path: Path, axes: str | None, channels: int
     np.testing.assert_array_equal(found, np.broadcast_to(stored, (T, H, W, 3)))
 
 
+def test_grey_images_become_rgb_and_transparency_is_left_out(tmp_path: Path) -> None:
+    four = np.concatenate([pictures(), pictures()[..., :1]], axis=3)
+    for stored in (four, four[..., :1], four[..., 0]):
+        expected = np.broadcast_to(stored.reshape(T, H, W, -1)[..., :3], (T, H, W, 3))
+        np.testing.assert_array_equal(shown(one(tmp_path, data=stored)), expected)
+
+
 def test_axes_that_could_be_either_are_refused_until_said(tmp_path: Path) -> None:
     path = one(tmp_path, data=np.arange(T * 36, dtype=np.uint8).reshape(T, 3, 4, 3))
     with pytest.raises(EpisodeError, match=r"first or last.*layout\.axes"):
         shown(path)
     assert shown(path, axes="THWC").shape == (T, 3, 4, 3) and shown(path, axes="TCHW").shape == (T, 4, 3, 3)
-
-
-def test_robomind_pictures_and_words_are_read(tmp_path: Path) -> None:
-    path = tmp_path / "task/success_episodes/train/0702_1/data/trajectory.hdf5"
-    path.parent.mkdir(parents=True)
-    flat = np.repeat(np.arange(T, dtype=np.uint8) * 20, H * W * 3).reshape(T, H, W, 3)
-    with h5py.File(path, "w") as file:
-        stored = file.create_dataset("observations/rgb_images/camera_top", (T,), h5py.vlen_dtype(np.uint8))
-        for row, picture in enumerate(flat):
-            stored[row] = cv2.imencode(".jpg", picture)[1].reshape(-1)
-        file["puppet/joint_position"] = np.zeros((T, 7))
-        file["master/joint_position"] = np.ones((T, 7))
-        file["language_raw"] = np.array([b"put the cup away"])
-        file["language_distilbert"] = np.zeros((1, 1, 768), np.float32)
-    arm = embodiment(
-        action={"space": "joint_position", "components": [{"key": "master/joint_position", "dims": 7}]},
-        state={"components": [{"key": "puppet/joint_position", "dims": 7}]},
-        cameras=[{"name": "top", "key": "observations/rgb_images/camera_top"}],
-    )
-    source = open_source("hdf5")
-    (ref,) = source.index(str(tmp_path), arm)
-    episode = source.read(str(tmp_path), ref.id, arm)
-    assert ref.id == "task/success_episodes/train/0702_1/data/trajectory"
-    assert episode.instruction == "put the cup away"
-    means = episode.streams["top"].frames(range(T)).mean(axis=(1, 2, 3))
-    assert np.abs(means - 20 * np.arange(T)).max() < 3
 
 
 def test_signed_bytes_and_opaque_rows_are_pictures(tmp_path: Path) -> None:
@@ -231,60 +212,44 @@ def test_a_json_of_the_simulator_may_be_anything(tmp_path: Path) -> None:
         assert shown(path, [0]).shape == (1, H, W, 3)
 
 
-@pytest.mark.parametrize("names", ["trials/t{:03}", "t{:03}", "episodes/{}", "a/run_b/{}", "2026-11-{}"])
-def test_numbered_groups_with_pictures_and_commands_are_episodes(tmp_path: Path, names: str) -> None:
+DAYS = ["day_1/t0", "day_1/t1", "day_2/t0", "day_2/t1"]
+TASKS = ["pick/t0", "pick/t1", "place/t0", "place/t1"]
+BESIDE = ["meta/camera", "version"]  # of other groups, which are no episodes
+GROUPS: dict[str, tuple[list[str], list[str]]] = {  # episodes that are written, and what the file holds
+    **{
+        names: (
+            [names.format(i) for i in range(8, 12)],
+            [names.split("/")[-1].format(i) for i in range(8, 12)],
+        )
+        for names in ("trials/t{:03}", "t{:03}", "episodes/{}", "a/run_b/{}", "2026-11-{}")
+    },
+    **{
+        parts: ([parts.format(i) for i in range(3)], ["a"])
+        for parts in ("arm_{}", "robots/{}", "wrist_cam{}")
+    },
+    "one below": (["trials/t0", "trials/t1", *BESIDE], ["t0", "t1"]),
+    "one at the top": (["t0", "t1", *BESIDE], ["t0", "t1"]),
+    "days": ([*DAYS, *BESIDE], DAYS),
+    "tasks": ([*TASKS, "version"], TASKS),
+    "cameras": (["cam_0/rgb", "cam_1/rgb"], ["a"]),
+    "arms": (["arm_0/q", "arm_1/q"], ["a"]),
+    "both": (["cam_0/rgb", "cam_1/rgb", "cam_0/pose", "cam_1/pose", "cmd"], ["a"]),
+    "a robot": (["cam_0/rgb", "cam_1/rgb", "robot/q"], ["a"]),
+    "one alone": (["t0/rgb", "t0/q"], ["a"]),
+}
+
+
+@pytest.mark.parametrize("case", GROUPS)
+def test_numbered_groups_with_pictures_and_commands_are_episodes_unless_parts_of_one(tmp_path, case) -> None:
+    written, ids = GROUPS[case]
     with h5py.File(tmp_path / "a.h5", "w") as file:
-        for number in range(8, 12):
-            fill(file.create_group(names.format(number)))
-    source = open_source("hdf5")
-    last = [names.format(number).split("/")[-1] for number in range(8, 12)]
-    assert source.episode_ids(tmp_path / "a.h5") == last
-    assert source.inspect(tmp_path / "a.h5").episodes == 4
-
-
-@pytest.mark.parametrize(
-    "keys",
-    [
-        ["cam_0/rgb", "cam_1/rgb"],  # cameras
-        ["arm_0/q", "arm_1/q"],  # arms
-        ["cam_0/rgb", "cam_1/rgb", "cam_0/pose", "cam_1/pose", "cmd"],  # with what belongs to both
-        ["cam_0/rgb", "cam_1/rgb", "robot/q"],
-        ["t0/rgb", "t0/q"],  # one alone shows nothing
-    ],
-    ids=lambda keys: keys[-1],
-)
-def test_numbered_groups_of_one_episode_are_none(tmp_path: Path, keys: list[str]) -> None:
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        for key in keys:
-            file[key] = pictures(T) if key.endswith("rgb") else np.zeros((T, 3), np.float32)
-    assert open_source("hdf5").episode_ids(tmp_path / "a.h5") == ["a"]
-
-
-@pytest.mark.parametrize("stem", ["arm_{}", "robots/{}", "wrist_cam{}"])
-def test_numbered_parts_with_pictures_and_numbers_are_one_episode(tmp_path: Path, stem: str) -> None:
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        for number in range(3):
-            fill(file.create_group(stem.format(number)))
-    assert open_source("hdf5").episode_ids(tmp_path / "a.h5") == ["a"]
-
-
-@pytest.mark.parametrize(
-    ("names", "ids"),
-    [
-        (["trials/t0", "trials/t1", "trials/t2"], ["t0", "t1", "t2"]),
-        (["t0", "t1", "t2"], ["t0", "t1", "t2"]),
-        (["day_1/t0", "day_1/t1", "day_2/t0", "day_2/t1"], ["day_1/t0", "day_1/t1", "day_2/t0", "day_2/t1"]),
-        (["pick/t0", "pick/t1", "place/t0", "place/t1"], ["pick/t0", "pick/t1", "place/t0", "place/t1"]),
-    ],
-    ids=["below", "at the top", "days", "tasks"],
-)
-def test_what_is_short_beside_numbered_episodes_is_none(tmp_path, names, ids) -> None:
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        for name in names:
-            fill(file.create_group(name))
-        if not names[0].startswith("pick"):
-            file["meta/camera"], file["meta/robot"] = np.eye(3), "ur5"
-        file["version"] = 2
+        for key in written:
+            if key in BESIDE:
+                file[key] = np.eye(3)
+            elif key.endswith(("rgb", "/q", "pose", "cmd")):
+                file[key] = pictures(T) if key.endswith("rgb") else np.zeros((T, 3), np.float32)
+            else:
+                fill(file.create_group(key))
     assert open_source("hdf5").episode_ids(tmp_path / "a.h5") == ids
 
 

@@ -292,14 +292,6 @@ def test_a_camera_not_asked_for_is_not_fetched(hub: Hub) -> None:
     assert not any(path.endswith(".mp4") for path in hub.served())
 
 
-def test_a_second_worker_fetches_nothing_again(hub: Hub) -> None:
-    uri = "hf://datasets/team/three"
-    open_source("lerobot").read(uri, "episode_000000", embodiment()).streams["cam"].frames([0])
-    hub.log.clear()
-    open_source("lerobot").read(uri, "episode_000002", embodiment()).streams["cam"].frames([0])
-    assert hub.served() == []
-
-
 def test_a_revision_is_the_one_named(hub: Hub) -> None:
     index = open_source("lerobot").index
     assert len(index("hf://datasets/team/two@v0.9")) == 2 and len(index("team/two@main")) == 3

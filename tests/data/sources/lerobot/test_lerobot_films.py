@@ -5,6 +5,7 @@ e shows 10 e + i, and so does its action.
 """
 
 import gc
+import json
 import weakref
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -21,6 +22,7 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import open_source
 from hma_data.sources.common.video_file import _cached_table, frame_table
 from hma_data.sources.lerobot import films
+from tests.data.sources.lerobot.test_lerobot import embodiment
 from tests.data.videos import CAMERA, TASKS, encode, make_v2, make_v3, number_of
 from tests.hostile import Edit, Row
 
@@ -30,15 +32,9 @@ EPISODES = [f"episode_{i:06d}" for i in range(3)]
 
 
 def robot(**source: Any) -> Embodiment:
-    values = {
-        "id": "testbot",
-        "kind": "real",
-        "frequency_hz": 10,
-        "action": {"space": "joint_position", "components": [{"key": "action", "dims": 2}]},
-        "cameras": [{"name": "cam", "key": CAMERA}],
-        "source": {"format": "lerobot", **source},
-    }
-    return Embodiment.from_values(values, "test")
+    return embodiment(
+        cameras=[{"name": "cam", "key": CAMERA}], state=None, source={"format": "lerobot", **source}
+    )
 
 
 def outcome(folder: Path, **source: Any) -> list[str]:
@@ -309,8 +305,6 @@ def test_an_episode_without_words_is_flagged_and_named(tmp_path: Path) -> None:
 
 
 def test_the_measured_rate_is_offered_where_features_lack_the_times(tmp_path: Path) -> None:
-    import json
-
     folder = make_v2(tmp_path / "v2", LENGTHS)
     for path in folder.rglob("*.parquet"):
         change_column(path, "timestamp", lambda value, row: row["frame_index"] / 9.3)

@@ -253,18 +253,6 @@ def test_where_an_episode_ends_in_a_video_is_judged_as_lerobot_does(altered: Pat
     assert open_source("lerobot").inspect(str(altered)).problems == ()
 
 
-def test_no_row_takes_a_picture_of_the_next_episode(altered: Path) -> None:
-    (path,) = (altered / "meta/episodes").rglob("*.parquet")
-    table = pq.read_table(path)
-    starts = table[f"videos/{CAM}/from_timestamp"].to_pylist()
-    starts[2] -= 1 / FPS  # the third episode begins with the last picture of the second
-    name = f"videos/{CAM}/from_timestamp"
-    pq.write_table(table.set_column(table.column_names.index(name), name, pa.array(starts)), path)
-    robot, source = arm(cameras=[{"name": "cam", "key": CAM}], state=None), open_source("lerobot")
-    with pytest.raises(EpisodeError, match=r"would show .* and episode_000002 .* at the same time"):
-        source.read(str(altered), "episode_000001", robot)
-
-
 def as_v21(root: Path, out: Path, row_hz: float = FPS) -> Path:
     """Bring a set to version 2.1 with the names of version 3 in its templates, and rows at another rate."""
     files = sorted(root.rglob("*.mp4"))
