@@ -272,7 +272,7 @@ def _keys(group: h5py.Group, place: EpisodeGroup, pixels: Container[str]) -> Ite
 
 def _kind(item: h5py.Dataset, where: str, has_colours: bool) -> tuple[str, tuple[int, ...], str | None]:
     """Return kind, shape of one sample, and codec; `has_colours` tells images of other numbers than uint8."""
-    shape = item.shape or ()
+    shape: tuple[int, ...] = item.shape or ()
     images = image_kind(item) if shape and shape[0] and is_plausible(item) else None
     if has_colours or images == "raw":
         is_last = len(shape) == 3 or shape[3] in CHANNELS
