@@ -28,16 +28,10 @@ Shape = tuple[int | None, ...]
 BFLOAT16 = "bfloat16"  # NumPy lacks this dtype: values become float32
 MAX_TENSOR_BYTES = 1 << 28  # most bytes of one value, against decompression bombs and errors
 
-# Content keys of a feature in features.json -> the class that wrote it; files before TFDS 4.6 name the class.
-CONTENT = {
-    "featuresDict": "FeaturesDict", "sequence": "Sequence", "tensor": "Tensor", "image": "Image",
-    "video": "Video", "text": "Text", "classLabel": "ClassLabel", "boundingBox": "BBoxFeature",
-    "audio": "Audio", "translation": "Translation", "jsonFeature": "Json",
-}  # fmt: skip
-FIXED: dict[str, tuple[str, Shape, str]] = {  # class -> kind, shape and dtype
-    "Text": ("text", (), "string"),
-    "ClassLabel": ("number", (), "int64"),
-    "BBoxFeature": ("number", (4,), "float32"),
+FIXED: dict[str, tuple[str, Shape, str]] = {  # content key in features.json -> kind, shape and dtype
+    "text": ("text", (), "string"),
+    "classLabel": ("number", (), "int64"),
+    "boundingBox": ("number", (4,), "float32"),
 }
 
 
@@ -74,56 +68,36 @@ def read_features(text: bytes, where: str) -> dict[str, RldsFeature]:
 
 
 def _leaves(node: dict[str, Any], name: str, nesting: Shape) -> list[RldsFeature]:
-    kind, content = _content(node)
-    if kind == "FeaturesDict":
-        children = content.get("features", content)
-        if isinstance(children.get("type"), str):  # legacy, and a feature is named "features"
-            children = content
+    if "featuresDict" in node:
+        children = node["featuresDict"].get("features", {})
         home = f"{name}/" if name else ""
         return [leaf for key, child in children.items() for leaf in _leaves(child, home + key, nesting)]
-    if kind in ("Sequence", "Dataset"):
+    if "sequence" in node:
+        content = node["sequence"]
         return _leaves(content["feature"], name, (*nesting, _size(content.get("length"))))
-    if kind == "Translation":
-        return [RldsFeature(f"{name}/{key}", "text", (), "string", nesting) for key in content["languages"]]
-    return [_leaf(kind, content, name, nesting)]
+    return [_leaf(node, name, nesting)]
 
 
-def _leaf(kind: str, content: dict[str, Any], name: str, nesting: Shape) -> RldsFeature:
-    stated, dtype = content.get("shape"), str(content.get("dtype") or "")
-    shape = tuple(map(_size, (stated.get("dimensions") if isinstance(stated, dict) else stated) or ()))
-    if kind in FIXED:
-        return RldsFeature(name, *FIXED[kind], nesting)
-    if kind in ("Image", "LabeledImage", "Video"):
-        nesting = (*nesting, *(shape[:1] or (None,))) if kind == "Video" else nesting
-        codec = content.get("encodingFormat") or content.get("encoding_format") or "png"
-        return RldsFeature(
-            name, "image", shape[-3:] or (None, None, 3), dtype or "uint8", nesting, codec=codec
-        )
-    if kind not in ("Tensor", "Scalar"):
-        return RldsFeature(name, "other", shape, dtype or kind, nesting)
+def _leaf(node: dict[str, Any], name: str, nesting: Shape) -> RldsFeature:
+    for key, fixed in FIXED.items():
+        if key in node:
+            return RldsFeature(name, *fixed, nesting)
+    content = node.get("tensor") or node.get("image")
+    if not content:
+        return RldsFeature(name, "other", (), str(node["pythonClassName"]).rsplit(".", 1)[-1], nesting)
+    shape = tuple(map(_size, content.get("shape", {}).get("dimensions", ())))
+    dtype = str(content.get("dtype") or "")
+    if "image" in node:
+        codec = content.get("encodingFormat") or "png"
+        return RldsFeature(name, "image", shape or (None, None, 3), dtype or "uint8", nesting, codec=codec)
     if dtype in ("string", "object", "str"):
         return RldsFeature(name, "text", shape, "string", nesting)
-    encoding = str(content.get("encoding") or "none").lower()
     try:
         readable = dtype == BFLOAT16 or np.dtype(dtype).kind in "fiub"
     except TypeError:  # float8 and the like
         readable = False
-    if not nesting and shape and shape[0] is None and encoding == "none":
-        shape, nesting = shape[1:], (None,)  # an episode without `steps`: the tensor is the sequence
+    encoding = str(content.get("encoding") or "none")
     return RldsFeature(name, "number" if readable else "other", shape, dtype, nesting, encoding)
-
-
-def _content(node: dict[str, Any]) -> tuple[str, dict[str, Any]]:
-    """Return (class, its values) of a feature as written by any version of TFDS."""
-    if "type" in node:  # before 4.6
-        kind, content = str(node["type"]).rsplit(".", 1)[-1], node.get("content") or {}
-        if isinstance(content, str):
-            content = json.loads(content)
-        return kind, content
-    for key, kind in CONTENT.items():
-        if node.get(key) is not None:
-            return kind, node[key]
-    return str(node.get("pythonClassName") or "").rsplit(".", 1)[-1], {}
 
 
 def _size(value: Any) -> int | None:
