@@ -93,6 +93,7 @@ def image(shape, codec="png", dtype="uint8"):
     }
 
 
+SHARD = "toy-train.tfrecord-00000-of-00001"  # the name of an only one
 TEXT = {"pythonClassName": "x.Text", "text": {}}
 
 
@@ -108,19 +109,17 @@ def png(picture: np.ndarray) -> bytes:
     return cv2.imencode(".png", picture[..., ::-1] if picture.ndim == 3 else picture)[1].tobytes()
 
 
-def write(folder: Path, shards: dict, steps: dict, info=True, metadata=None) -> Path:
+def write(folder: Path, shards: dict, steps: dict, metadata=None, file_format="tfrecord") -> Path:
+    """A folder whose shards have TFDS's names, which dataset_info.json states with their records."""
     folder.mkdir(parents=True)
     tree = {"steps": sequence(features_dict(steps), "Dataset")}
     tree["episode_metadata"] = features_dict(metadata or {"file_path": TEXT})
     (folder / "features.json").write_text(json.dumps(features_dict(tree)))
     splits: dict[str, list[str]] = {}
     for name, records in shards.items():
-        (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_bytes(b"".join(frame(encode(item)) for item in records))
         splits.setdefault(name.split(".")[0].split("-")[-1], []).append(str(len(records)))
-    if info:
-        stated = [{"name": split, "shardLengths": counts} for split, counts in splits.items()]
-        (folder / "dataset_info.json").write_text(
-            json.dumps({"name": "toy", "version": "1.0.0", "splits": stated})
-        )
+    stated = [{"name": split, "shardLengths": counts} for split, counts in splits.items()]
+    info = {"name": "toy", "version": "1.0.0", "fileFormat": file_format, "splits": stated}
+    (folder / "dataset_info.json").write_text(json.dumps(info))
     return folder

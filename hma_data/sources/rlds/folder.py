@@ -1,15 +1,14 @@
 """Open a TFDS folder: its version, its splits, its shards, and the place of each episode in them.
 
 `dataset_info.json` names the shards of each split by a template and gives the number of records of each, so
-an episode is found without opening the other shards. Shards that it does not list are found by name and
-counted. Paths are of this machine or of a store.
+an episode is found without opening the other shards. Paths are of this machine or of a store.
 """
 
 import math
 import re
 from bisect import bisect_right
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate
 from pathlib import Path
@@ -31,11 +30,6 @@ from hma_data.storage.yaml_io import first_fault
 LONGEST_JSON = 64 << 20  # most bytes of a description; more is an error
 MAX_RECORDS = 1_000_000  # that a shard may state
 TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
-NUMBER = r"-(?P<shard>\d{5,})(?:-of-(?P<shards>\d{5,}))?"
-NAMED = (  # forms of file names: the suffix after the number, or before it as TFDS writes it
-    re.compile(rf"(?P<stem>.+?)[-_]{NUMBER[1:]}\.(?:tfrecord|array_record)"),
-    re.compile(rf"(?P<stem>.+)\.(?:tfrecord|array_record)(?:{NUMBER})?"),
-)
 
 
 class _StatedSplit(BaseModel):
@@ -75,9 +69,8 @@ class Shard:
     """One TFRecord or ArrayRecord file of a split."""
 
     path: Path
-    number: int  # its place in the split
-    stated: int | None  # how many records dataset_info.json states; None where it states none
-    first: int = 0  # index within the split of its first record
+    count: int  # how many records dataset_info.json states; some may be cut off
+    first: int  # index within the split of its first record
 
     @property
     def records(self) -> RecordFile:
@@ -95,18 +88,10 @@ class Shard:
             SourceError: it cannot be read, or has more records than dataset_info.json says.
         """
         frames = self.records.framing(limit)
-        if self.stated is not None and len(frames) > self.stated:
-            fault = f"has {len(frames)} records, dataset_info.json says {self.stated}"
-            remedy = "write dataset_info.json again, or remove it: then the records are counted"
-            raise SourceError(self.path, fault, remedy)
+        if len(frames) > self.count:
+            fault = f"has {len(frames)} records, dataset_info.json says {self.count}"
+            raise SourceError(self.path, fault, "write dataset_info.json again with TFDS")
         return frames
-
-    def count(self) -> int:
-        """Count the episodes that the shard should have; a record cut off at the end counts."""
-        if self.stated is not None:
-            return self.stated
-        frames = self.framing()
-        return len(frames) + bool(frames.fault)
 
 
 @dataclass(frozen=True)
@@ -123,10 +108,9 @@ class RldsFolder:
 
     @cached_property
     def step_features(self) -> dict[str, RldsFeature]:
-        """Return the features over the steps by their path in a step; without `steps`, by their name."""
+        """Return the features over the steps by their path in a step."""
         found = self.features.items()
-        inside = {name.removeprefix("steps/"): leaf for name, leaf in found if name.startswith("steps/")}
-        return inside or {name: leaf for name, leaf in found if leaf.nesting}
+        return {name.removeprefix("steps/"): leaf for name, leaf in found if name.startswith("steps/")}
 
     def example(self, episode_id: str) -> tuple[Example, str]:
         """Return an episode's parsed record and the path of its shard.
@@ -155,7 +139,7 @@ class RldsFolder:
             first, stop, records = min(positions), max(positions) + 1, shard.records
             if records.blocks is None or 2 * len(positions) < stop - first:
                 continue
-            size, mean = records.blocks.size, records.blocks.size / max(shard.count(), 1)
+            size, mean = records.blocks.size, records.blocks.size / max(shard.count, 1)
             begin, end = max(0, int((first - 1) * mean)), min(size, math.ceil((stop + 1) * mean))
             records.blocks.expect([(begin, end)])
             if before:
@@ -172,7 +156,7 @@ class RldsFolder:
             raise EpisodeError(episode_id, f"is not in {self.uri}; an id is like {like}")
         shard = shards[max(0, bisect_right(shards, int(index), key=lambda item: item.first) - 1)]
         position = int(index) - shard.first
-        if not 0 <= position < shard.count():
+        if not 0 <= position < shard.count:
             raise EpisodeError(episode_id, f"is in no shard of {self.uri}")
         return shard, position
 
@@ -192,26 +176,21 @@ def open_folder(uri: str) -> RldsFolder:
     path = place(uri) if is_away(uri) else local_path(uri).absolute()
     only = path if _lists(path) and path.is_file() else None  # the one shard that the user chose
     root = _version_folder(uri, path.parent if only else path)
-    described = _description(root / "features.json")
-    if described is None:
-        fault = "has no features.json, without which its records cannot be understood"
-        raise SourceError(uri, fault, "copy it from where the records are from, or write it with TFDS")
+    features = read_features(_description(root / "features.json"), str(root / "features.json"))
     info = _dataset_info(root / "dataset_info.json")
     if info.file_format not in ("tfrecord", "array_record"):
         fault = f"holds {info.file_format} files; TFRecord and ArrayRecord files can be read"
         raise SourceError(uri, fault, "write it again with TFDS, as file_format tfrecord")
-    listing = [only] if only else _files_in(root) if _lists(root) else None
-    shards, problems = _stated_shards(root, info, listing)
-    if not shards:
-        shards, more = _named_shards(root, info, listing or [])
-        problems += more
-    if not shards:
-        fault = "holds no TFRecord file"
-        raise SourceError(uri, fault, "names are like name-train.tfrecord-00000-of-00001")
+    listing = {only} if only else _files_in(root) if _lists(root) else None
+    splits, problems = _shards(root, info, listing)
+    if not splits:
+        named = [info.shard_path(split, 0) for split in info.splits]
+        remedy = f"their names are like {named[0]}" if named else "it names none: write it with TFDS"
+        raise SourceError(uri, "holds no file that dataset_info.json names", remedy)
     return RldsFolder(
         uri=uri,
-        features=read_features(described, str(root / "features.json")),
-        splits={split: _counted(items) for split, items in shards.items()},
+        features=features,
+        splits=splits,
         remote=is_remote(root),
         name=info.name,
         version=info.version,
@@ -237,101 +216,57 @@ def _version_folder(uri: str, path: Path) -> Path:
     return folders[0] if folders else path
 
 
-def _files_in(root: Path) -> list[Path]:
-    """Return the files of a folder and of those directly below it, sorted."""
+def _files_in(root: Path) -> set[Path]:
+    """Return the files of a folder and of those directly below it."""
     found = (path for pattern in ("*", "*/*") for path in root.glob(pattern))
     with explained(root):
-        return sorted(path for path in found if is_remote(root) or path.is_file())
+        return {path for path in found if is_remote(root) or path.is_file()}
 
 
-def _description(path: Path) -> bytes | None:
-    """Return the bytes of a description; None where there is none."""
+def _description(path: Path) -> bytes:
+    """Return the bytes of a description."""
     with explained(path):
         if not is_remote(path) and path.is_file() and (size := path.stat().st_size) > LONGEST_JSON:
             fault = f"has {size:,} bytes, more than {LONGEST_JSON:,}"
             raise SourceError(path, fault, "a description by TFDS is smaller: check the file")
         try:
             return path.read_bytes()
-        except ABSENT:
-            return None
+        except ABSENT as fault:
+            said = f"has no {path.name}, without which its records cannot be understood"
+            remedy = "copy it from where the records are from, or write it with TFDS"
+            raise SourceError(path.parent, said, remedy) from fault
 
 
 def _dataset_info(path: Path) -> _DatasetInfo:
-    data = _description(path)
     try:
-        return _DatasetInfo() if data is None else _DatasetInfo.model_validate_json(data)
+        return _DatasetInfo.model_validate_json(_description(path))
     except ValidationError as fault:
-        remedy = "write it again with tensorflow_datasets, or remove it"
-        raise SourceError(path, first_fault(fault), remedy) from fault
+        raise SourceError(path, first_fault(fault), "write it again with tensorflow_datasets") from fault
 
 
-def _counted(shards: list[Shard]) -> tuple[Shard, ...]:
-    """Return the shards with `first` set; count the records where dataset_info.json does not state them."""
-    if all(shard.stated is not None for shard in shards):
-        return tuple(shards)
-    firsts = accumulate((shard.count() for shard in shards), initial=0)
-    return tuple(replace(shard, first=first) for shard, first in zip(shards, firsts))
+def _shards(
+    root: Path, info: _DatasetInfo, listing: set[Path] | None
+) -> tuple[dict[str, tuple[Shard, ...]], list[str]]:
+    """Return the shards that dataset_info.json names and that are there, and what is missing.
 
-
-def _stated_shards(
-    root: Path, info: _DatasetInfo, listing: list[Path] | None
-) -> tuple[dict[str, list[Shard]], list[str]]:
-    """Return the existing shards that dataset_info.json names, and what is missing."""
-    there = None if listing is None else set(listing)
-    shards: dict[str, list[Shard]] = {}
-    problems, absent = [], []
+    Args:
+        listing: the files that are there; None where they cannot be listed.
+    """
+    splits: dict[str, tuple[Shard, ...]] = {}
+    problems = []
     for split in info.splits:
         counts = split.shard_lengths
         firsts = accumulate(counts, initial=0)
         items = [
-            Shard(root / info.shard_path(split, number), number, records, first)
-            for number, (records, first) in enumerate(zip(counts, firsts))
+            Shard(root / info.shard_path(split, number), count, first)
+            for number, (count, first) in enumerate(zip(counts, firsts))
         ]
-        present = [item for item in items if there is None or item.path in there]
+        present = tuple(item for item in items if listing is None or item.path in listing)
         if present:
-            shards[split.name] = present
-            problems += _missing(split.name, len(present), len(items))
+            splits[split.name] = present
         elif sum(counts):
-            absent.append(f"split {split.name} of {sum(counts):,} episodes is missing")
-    return shards, problems + absent if shards else problems
-
-
-def _named_shards(
-    root: Path, info: _DatasetInfo, listing: Iterable[Path]
-) -> tuple[dict[str, list[Shard]], list[str]]:
-    """Return the same for a renamed dataset, or one without dataset_info.json, by the shards' names alone."""
-    stated = {split.name: split.shard_lengths for split in info.splits}
-    shards: dict[str, list[Shard]] = {}
-    totals: dict[str, int] = {}
-    for path in listing:
-        match = next((found for form in NAMED if (found := form.fullmatch(path.name))), None)
-        if not match:
-            continue
-        above = path.parent.relative_to(root).as_posix()
-        split = _split_of(match["stem"], info.name, stated) if above == "." else above
-        parts = match.groupdict()
-        number = int(parts["shard"] or len(shards.get(split, ())))
-        totals[split] = max(totals.get(split, 0), int(parts["shards"] or 0))
-        counts = stated.get(split, ())
-        records = counts[number] if number < len(counts) else None
-        shards.setdefault(split, []).append(Shard(path, number, records, sum(counts[:number])))
-    problems = []
-    for split, items in shards.items():
-        items.sort(key=lambda item: item.number)
-        problems += _missing(split, len(items), totals[split])
-    return shards, problems
-
-
-def _missing(split: str, present: int, shards: int) -> list[str]:
-    said = f"{shards - present} of {shards} shards of split {split} are missing"
-    return [said] if present < shards else []
-
-
-def _split_of(stem: str, dataset: str, stated: Iterable[str]) -> str:
-    """Return the split in a file's name, e.g. train of toy-train; a split's name may have hyphens itself."""
-    for split in sorted(stated, key=len, reverse=True):
-        if stem == split or stem.endswith(f"-{split}"):
-            return split
-    if dataset and stem.startswith(f"{dataset}-"):
-        return stem[len(dataset) + 1 :]
-    return stem.rsplit("-", 1)[-1]
+            problems.append(f"split {split.name} of {sum(counts):,} episodes is missing")
+        if 0 < len(present) < len(items):
+            said = f"{len(items) - len(present)} of {len(items)} shards of split {split.name} are missing"
+            problems.append(said)
+    return splits, problems

@@ -73,7 +73,7 @@ class RldsSource:
             own = None if len(names) == 1 else "train" if name == "train" else "val"
             rate = _steps_per_byte(folder, name)
             for shard in folder.splits[name]:
-                refs += (_remote_refs if folder.remote and shard.stated else _refs)(name, shard, own, rate)
+                refs += (_remote_refs if folder.remote else _refs)(name, shard, own, rate)
         if lengths := _lengths(folder, names, refs):
             refs = [replace(ref, frames=lengths.get(ref.id, ref.frames)) for ref in refs]
         if not any(ref.fingerprint for ref in refs):
@@ -135,7 +135,7 @@ def _refs(split: str, shard: Shard, own: str | None, rate: float) -> list[Episod
     """Return the episodes of a shard; an episode that is cut off or missing has no fingerprint."""
     frames = shard.framing()
     refs = []
-    for position in range(shard.count()):
+    for position in range(shard.count):
         there = position < len(frames)
         estimate = round(rate * int(frames.lengths[position])) if there else 1
         fingerprint = frames.fingerprint(position) if there else ""
@@ -147,9 +147,8 @@ def _remote_refs(split: str, shard: Shard, own: str | None, rate: float) -> list
     """Return the episodes of a remote shard from its size and mark alone; no record is read."""
     size, state = remote_state(shard.path)
     fingerprint = short_sha256(state, 24)
-    records = shard.stated or 1
-    frames = max(1, round(rate * size / records))
-    ids = (episode_id(split, shard.first + position) for position in range(records))
+    frames = max(1, round(rate * size / max(shard.count, 1)))
+    ids = (episode_id(split, shard.first + position) for position in range(shard.count))
     return [EpisodeRef(name, frames, own, fingerprint) for name in ids]
 
 
@@ -381,7 +380,7 @@ def _series(steps: Steps, key: str, survey: Survey) -> Series:
 
 
 def _facts(folder: RldsFolder) -> dict[str, str]:
-    splits = [f"{name} {sum(shard.count() for shard in shards)}" for name, shards in folder.splits.items()]
+    splits = [f"{name} {sum(shard.count for shard in shards)}" for name, shards in folder.splits.items()]
     outside = [name for name in folder.features if not name.startswith("steps/")]
     found = {"dataset": folder.name, "version": folder.version}
     return found | {"splits": ", ".join(splits), "episode keys": ", ".join(outside)}

@@ -46,7 +46,7 @@ def rlds(folder: Path) -> Path:
         record = {"steps/image": pictures, "steps/action": actions, "steps/language_instruction": [b"go"] * 5}
         records.append(record | {"episode_metadata/file_path": [b"x"]})
     steps = {"image": image((8, 10, 3)), "action": tensor((3,)), "language_instruction": TEXT}
-    return write(folder / "rlds", {"d-train.tfrecord-00000-of-00001": records}, steps)
+    return write(folder / "rlds", {"toy-train.tfrecord-00000-of-00001": records}, steps)
 
 
 def bag(folder: Path) -> Path:

@@ -1,6 +1,5 @@
 """ArrayRecord: files of its own writer, whole and cut."""
 
-import json
 import sys
 
 import fsspec
@@ -59,24 +58,18 @@ def test_records_are_read_as_they_were_put_in(tmp_path, sizes, options):
 STEPS = {"a": tensor((2,))}
 
 
-def dataset(folder, count=5):
-    records = [{"steps/a": np.full(4, i, np.float32)} for i in range(count)]
-    rlds_files.write(folder, {"toy-train.array_record-00000-of-00001": []}, STEPS)
-    write(folder / "toy-train.array_record-00000-of-00001", [encode(r) for r in records])
-    info = {
-        "name": "toy",
-        "fileFormat": "array_record",
-        "splits": [{"name": "train", "shardLengths": [str(count)]}],
-    }
-    (folder / "dataset_info.json").write_text(json.dumps(info))
+def dataset(folder):
+    name, records = (
+        "toy-train.array_record-00000-of-00001",
+        [{"steps/a": np.full(4, i, np.float32)} for i in range(5)],
+    )
+    rlds_files.write(folder, {name: records}, STEPS, file_format="array_record")
+    write(folder / name, [encode(record) for record in records])
     return folder
 
 
-@pytest.mark.parametrize("stated", [True, False])
-def test_a_dataset_of_array_records_is_read_like_any(tmp_path, stated):
+def test_a_dataset_of_array_records_is_read_like_any(tmp_path):
     folder = dataset(tmp_path / "d")
-    if not stated:
-        (folder / "dataset_info.json").unlink()
     refs = open_source("rlds").index(str(folder))
     assert detect(str(folder)) == "rlds"
     assert [(ref.id, ref.frames) for ref in refs] == [(f"train/{i:06d}", 2) for i in range(5)]

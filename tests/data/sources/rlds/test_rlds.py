@@ -19,9 +19,19 @@ from hma_data.registry.embodiment import Embodiment, find
 from hma_data.sources.base import open_source
 from hma_data.sources.detect import detect
 from hma_data.sources.rlds.example import Example
-from hma_data.sources.rlds.folder import Shard, open_folder
 from tests.data import rlds_files
-from tests.data.rlds_files import PROTO, TEXT, encode, features_dict, frame, image, png, sequence, tensor
+from tests.data.rlds_files import (
+    PROTO,
+    SHARD,
+    TEXT,
+    encode,
+    features_dict,
+    frame,
+    image,
+    png,
+    sequence,
+    tensor,
+)
 
 STEPS = {
     "observation": features_dict({"image": image((8, 10, 3)), "state": tensor((3,), "float64")}),
@@ -49,13 +59,12 @@ def record(episode: int, steps: int) -> dict:
     }
 
 
-def write(folder: Path, shards: dict, steps=None, info=True, metadata=None) -> Path:
-    return rlds_files.write(folder, shards, steps or STEPS, info, metadata)
+def write(folder: Path, shards: dict, steps=None, metadata=None) -> Path:
+    return rlds_files.write(folder, shards, steps or STEPS, metadata)
 
 
-def toy(folder: Path, lengths=(4, 3, 5), info=True) -> Path:
-    records = [record(i, steps) for i, steps in enumerate(lengths)]
-    return write(folder, {"toy-train.tfrecord-00000-of-00001": records}, info=info)
+def toy(folder: Path, lengths=(4, 3, 5)) -> Path:
+    return write(folder, {SHARD: [record(i, steps) for i, steps in enumerate(lengths)]})
 
 
 def embodiment(**changes) -> Embodiment:
@@ -99,7 +108,7 @@ def test_an_episode_is_read_as_it_was_written(tmp_path):
 
 def test_pictures_are_decoded_only_when_asked_for(tmp_path):
     broken = record(0, 3) | {"steps/observation/image": [b"junk", png(pictures(0, 3)[1]), b""]}
-    stream = read(write(tmp_path / "d", {"d-train.tfrecord": [broken]}), "train/000000").streams["primary"]
+    stream = read(write(tmp_path / "d", {SHARD: [broken]}), "train/000000").streams["primary"]
     np.testing.assert_array_equal(stream.frames([1])[0], pictures(0, 3)[1])
     for index in (0, 2):
         with pytest.raises(EpisodeError, match=f"step {index}.*cannot be decoded"):
@@ -117,7 +126,7 @@ def test_tensors_of_every_dtype_and_encoding(tmp_path, dtype, encoding):
         blobs = [row.tobytes() for row in values]
         stored = blobs if encoding == "bytes" else [zlib.compress(blob) for blob in blobs]
     steps = {"observation": STEPS["observation"], "a": tensor((3,), dtype, encoding)}
-    folder = write(tmp_path / "d", {"d-train.tfrecord": [record(0, 2) | {"steps/a": stored}]}, steps)
+    folder = write(tmp_path / "d", {SHARD: [record(0, 2) | {"steps/a": stored}]}, steps)
     actions = read(folder, "train/000000", numbers_only(key="a", dims=3)).actions[0].values
     np.testing.assert_array_equal(actions, values.astype(np.float32))
 
@@ -126,7 +135,7 @@ def test_raw_pictures_kept_as_tensors(tmp_path):
     raw = pictures(5, 2)
     steps = STEPS | {"plain": tensor((8, 10, 3), "uint8"), "packed": tensor((8, 10, 3), "uint8", "zlib")}
     stored = {"steps/plain": raw.astype(np.int64), "steps/packed": [zlib.compress(p.tobytes()) for p in raw]}
-    folder = write(tmp_path / "d", {"d-train.tfrecord": [record(0, 2) | stored]}, steps)
+    folder = write(tmp_path / "d", {SHARD: [record(0, 2) | stored]}, steps)
     cameras = [{"name": "a", "key": "plain"}, {"name": "b", "key": "packed"}]
     episode = read(folder, "train/000000", embodiment(cameras=cameras))
     for stream in episode.streams.values():
@@ -141,7 +150,7 @@ def test_a_nested_sequence_of_one_length_is_a_vector_and_a_varying_one_is_refuse
         "steps/found/ragged_flat_values": [1, 2, 3],
         "steps/found/ragged_row_lengths_0": [1, 2],
     }
-    folder = write(tmp_path / "d", {"d-train.tfrecord": [record(0, 2) | stored]}, steps)
+    folder = write(tmp_path / "d", {SHARD: [record(0, 2) | stored]}, steps)
     episode = read(folder, "train/000000", numbers_only(key="goal", dims=6))
     np.testing.assert_array_equal(episode.actions[0].values, np.arange(12).reshape(2, 6))
     with pytest.raises(EpisodeError, match="varies from 1 to 2"):
@@ -151,7 +160,7 @@ def test_a_nested_sequence_of_one_length_is_a_vector_and_a_varying_one_is_refuse
 def test_inspect_tells_of_a_key_of_varying_length_as_a_finding(tmp_path, caplog, capsys):
     steps = STEPS | {"found": sequence(tensor((), "int32"))}
     stored = {"steps/found/ragged_flat_values": [1, 2, 3], "steps/found/ragged_row_lengths_0": [0, 3]}
-    folder = write(tmp_path / "d", {"d-train.tfrecord": [record(0, 2) | stored]}, steps)
+    folder = write(tmp_path / "d", {SHARD: [record(0, 2) | stored]}, steps)
     told = [one for one in RLDS.inspect(str(folder)).findings if one.key == "found"]
     assert [(one.check, one.severity) for one in told] == [("rows", "info")]
     assert "found varies from 0 to 3 entries per step" in told[0].message
@@ -173,7 +182,7 @@ def test_unpacked_lists_are_read_like_packed_ones():
 def test_of_several_instructions_the_first_counts(tmp_path, texts):
     steps = STEPS | ({"language_instruction": tensor((3,), "string")} if len(texts) > 2 else {})
     item = record(0, 2) | {"steps/language_instruction": [text.encode() for text in texts]}
-    folder = write(tmp_path / "d", {"d-train.tfrecord": [item]}, steps)
+    folder = write(tmp_path / "d", {SHARD: [item]}, steps)
     assert read(folder, "train/000000").instruction == "lift"
 
 
@@ -185,7 +194,7 @@ def test_an_instruction_kept_as_letter_codes(tmp_path, key):
     del steps["language_instruction"]
     codes = np.array([*"push é".encode(), 0, 0, 0, 0, 0])
     stored = record(0, 2) | {"steps/observation/instruction": np.tile(codes, 2)}
-    folder = write(tmp_path / "d", {"d-train.tfrecord": [stored]}, steps)
+    folder = write(tmp_path / "d", {SHARD: [stored]}, steps)
     robot = embodiment(source={"format": "rlds", "instruction": key}, state=None)
     assert read(folder, "train/000000", robot).instruction == ("push é" if key else "")
 
@@ -194,13 +203,13 @@ def test_an_instruction_kept_as_letter_codes(tmp_path, key):
 def test_success_as_the_episode_states_it(tmp_path, stated, expected):
     item = record(0, 2) | {"episode_metadata/success": [stated]}
     metadata = {"success": tensor((), "bool")}
-    folder = write(tmp_path / "d", {"d-train.tfrecord": [item]}, metadata=metadata)
+    folder = write(tmp_path / "d", {SHARD: [item]}, metadata=metadata)
     assert read(folder, "train/000000").success is expected
 
 
 @pytest.mark.parametrize("ends", [{"steps/is_terminal": [0, 0]}, {"steps/reward": [0.2, 0.7]}])
 def test_success_is_unknown_without_a_rewarded_terminal_step_or_with_dense_rewards(tmp_path, ends):
-    folder = write(tmp_path / "d", {"d-train.tfrecord": [record(0, 2) | ends]})
+    folder = write(tmp_path / "d", {SHARD: [record(0, 2) | ends]})
     assert read(folder, "train/000000").success is None
 
 
@@ -245,7 +254,7 @@ def test_a_dataset_with_one_split_leaves_splitting_to_the_toolkit(tmp_path):
 def test_the_plan_of_a_small_dataset_has_as_many_frames_as_its_inspection(tmp_path, long_text):
     records = [record(0, 10), record(1, 20), record(2, 5)]
     records[long_text]["episode_metadata/file_path"] = [b"x" * 50_000]
-    folder = str(write(tmp_path / "d", {"toy-train.tfrecord-00000-of-00001": records}))
+    folder = str(write(tmp_path / "d", {SHARD: records}))
     assert [ref.frames for ref in RLDS.index(folder)] == [10, 20, 5]
     assert RLDS.inspect(folder).frames == 35
 
@@ -266,7 +275,7 @@ def test_fingerprints_follow_the_content(tmp_path):
 
 def test_the_uri_may_name_the_dataset_the_version_or_one_shard(tmp_path):
     version = toy(tmp_path / "toy" / "1.0.0")
-    shard = version / "toy-train.tfrecord-00000-of-00001"
+    shard = version / SHARD
     for uri in (version.parent, version, shard, f"file://{version}"):
         assert len(RLDS.episode_ids(str(uri))) == 3
     toy(tmp_path / "toy" / "2.0.0")
@@ -300,20 +309,6 @@ def test_the_version_folder_is_looked_for_once_and_again_by_an_index(tmp_path, m
     assert read(newer, "train/000000").source == read(tmp_path / "data", "train/000000").source
 
 
-def test_an_episodes_shard_is_found_without_a_look_at_each(tmp_path, monkeypatch):
-    names = [f"toy-train.tfrecord-{i:05d}-of-00064" for i in range(64)]
-    folder = open_folder(str(write(tmp_path / "d", {name: [record(i, 2)] for i, name in enumerate(names)})))
-    looked: list[int] = []
-
-    def first(self: Shard) -> int:
-        looked.append(self.number)
-        return self.__dict__["first"]
-
-    monkeypatch.setattr(Shard, "first", property(first))
-    assert folder.example("train/000037")[1].endswith(names[37])
-    assert len(looked) < 16
-
-
 def test_missing_shards_keep_the_ids_of_the_others(tmp_path, caplog):
     names = [f"toy-train.tfrecord-{i:05d}-of-00003" for i in range(3)]
     folder = write(tmp_path / "d", {name: [record(i, 2), record(i, 3)] for i, name in enumerate(names)})
@@ -332,40 +327,6 @@ def test_a_split_without_its_files_is_told(tmp_path):
     (folder / names[1]).unlink()
     assert "split test of 1 episodes is missing" in RLDS.inspect(str(folder)).problems
     assert not RLDS.inspect(str(folder / names[0])).problems  # named by itself, the rest is not missed
-
-
-def test_a_renamed_dataset_is_found_by_its_files(tmp_path):
-    folder = toy(tmp_path / "d")
-    shard = next(folder.glob("*.tfrecord*"))
-    shard.rename(folder / shard.name.replace("toy", "other_name"))
-    assert read(folder, "train/000001").instruction == "lift é 1"
-
-
-def test_features_json_of_older_tfds(tmp_path):
-    def legacy(node):
-        kind = node["pythonClassName"]
-        if "featuresDict" in node:
-            return {
-                "type": kind,
-                "content": {key: legacy(item) for key, item in node["featuresDict"]["features"].items()},
-            }
-        if "sequence" in node:
-            return {"type": kind, "content": {"feature": legacy(node["sequence"]["feature"]), "length": None}}
-        content = next(value for key, value in node.items() if key != "pythonClassName")
-        if "shape" in content:
-            shape = [int(size) for size in content["shape"].get("dimensions", [])]
-            content = {
-                "shape": shape,
-                "dtype": content["dtype"],
-                "encoding_format": content.get("encodingFormat"),
-            }
-        return {"type": kind, "content": content}
-
-    folder = toy(tmp_path / "d")
-    expected = read(folder, "train/000000").actions[0].values
-    tree = json.loads((folder / "features.json").read_text())
-    (folder / "features.json").write_text(json.dumps(legacy(tree)))
-    np.testing.assert_array_equal(read(folder, "train/000000").actions[0].values, expected)
 
 
 # -- inspection
@@ -401,19 +362,19 @@ def whole(tmp_path_factory):
     return folder, next(folder.glob("*.tfrecord*")).read_bytes(), actions
 
 
-def _read_damaged(whole, data: bytes, tmp_path_factory, info: bool) -> set[str]:
+def _read_damaged(whole, data: bytes, tmp_path_factory) -> set[str]:
     """Ids that could be read, each checked to be as it was; the others raised EpisodeError."""
     folder, _, actions = whole
     copy = tmp_path_factory.mktemp("damaged")
-    for name in ("features.json", "dataset_info.json")[: 2 if info else 1]:
+    for name in ("features.json", "dataset_info.json"):
         shutil.copy(folder / name, copy)
-    (copy / "toy-train.tfrecord-00000-of-00001").write_bytes(data)
+    (copy / SHARD).write_bytes(data)
     try:
         ids = RLDS.episode_ids(str(copy))
     except SourceError as fault:
         assert "holds no readable episode" in str(fault) or "gzip" in str(fault)
         return set()
-    assert not info or ids == list(actions)
+    assert ids == list(actions)
     good = set()
     for name in ids:
         try:
@@ -429,7 +390,7 @@ def _read_damaged(whole, data: bytes, tmp_path_factory, info: bool) -> set[str]:
 def test_truncated_at_any_byte_the_whole_episodes_before_it_are_read(whole, tmp_path_factory, data):
     _, content, actions = whole
     cut = data.draw(st.integers(0, len(content) - 1))
-    good = _read_damaged(whole, content[:cut], tmp_path_factory, data.draw(st.booleans()))
+    good = _read_damaged(whole, content[:cut], tmp_path_factory)
     ends, position = [], 0
     while position < len(content):
         position += 16 + struct.unpack_from("<Q", content, position)[0]
@@ -442,7 +403,7 @@ def test_a_flipped_byte_anywhere_is_noticed(whole, tmp_path_factory, data):
     _, content, actions = whole
     place, bits = data.draw(st.integers(0, len(content) - 1)), data.draw(st.integers(1, 255))
     damaged = content[:place] + bytes([content[place] ^ bits]) + content[place + 1 :]
-    assert len(_read_damaged(whole, damaged, tmp_path_factory, True)) < len(actions)
+    assert len(_read_damaged(whole, damaged, tmp_path_factory)) < len(actions)
 
 
 @given(st.data())
@@ -450,9 +411,8 @@ def test_a_wrong_record_with_a_right_checksum_gives_an_episode_error_or_an_episo
     raw = bytearray(encode(record(0, 3)))
     for _ in range(data.draw(st.integers(1, 4))):
         raw[data.draw(st.integers(0, len(raw) - 1))] = data.draw(st.integers(0, 255))
-    folder = write(tmp_path_factory.mktemp("wrong") / "d", {"toy-train.tfrecord": []})
-    (folder / "toy-train.tfrecord").write_bytes(frame(bytes(raw)))
-    (folder / "dataset_info.json").unlink()
+    folder = toy(tmp_path_factory.mktemp("wrong") / "d", (3,))
+    (folder / SHARD).write_bytes(frame(bytes(raw)))
     try:
         episode = read(folder, "train/000000")
         episode.streams["primary"].frames(range(len(episode.actions[0].values)))
@@ -521,6 +481,6 @@ def test_a_folder_of_any_name_is_read(name, tmp_path):
 
 def test_of_many_episodes_that_cannot_be_read_the_first_is_told(tmp_path):
     toy(tmp_path / "toy", (2,) * 7)
-    (tmp_path / "toy" / "features.json").write_text("{}")
+    (tmp_path / "toy" / "features.json").write_text('{"featuresDict": {}}')
     with pytest.raises(SourceError, match="7 of 7 sampled episodes, such as train/000000: holds none of the"):
         RLDS.inspect(str(tmp_path / "toy"))

@@ -15,11 +15,11 @@ from hma_data.inspection.inspect import examine
 from hma_data.sources.base import open_source
 from hma_data.storage.yaml_io import parse_yaml
 from tests.data import rlds_files
-from tests.data.rlds_files import encode, frame, image, png, tensor
+from tests.data.rlds_files import SHARD, encode, frame, image, png, tensor
 from tests.data.sources.rlds.test_rlds import STEPS, embodiment, pictures, read, record, write
 from tests.hostile import Edit, Row, check_refused, cut, flip, of, swap, untouched, values, whole
 
-SHARD, INFO, FEATURES = "toy-train.tfrecord-00000-of-00001", "dataset_info.json", "features.json"
+INFO, FEATURES = "dataset_info.json", "features.json"
 MORE = {
     "depth": image((8, 8, 1), dtype="uint16"), "zipped": tensor((3,), "float32", "zlib"),
     "text": STEPS["language_instruction"],
@@ -75,6 +75,7 @@ INSPECTED = {"actions of NaN": "action/move is not finite at step 1", "a record 
 INFINITE = '{"tensor": {"dtype": "float32", "shape": {"dimensions": [1e400]}}}'
 ALL: dict[str, Row] = {  # no episode can be used
     "no features": (of(FEATURES, Path.unlink), "has no features.json"),
+    "no info": (of(INFO, Path.unlink), "has no dataset_info.json.* copy it from where the records are from"),
     "features cut short": (of(FEATURES, cut(1)), "not a TFDS features.json"),
     "features nested too deeply": (of(FEATURES, whole("[" * 100_000)), "not a TFDS features.json"),
     "a size of infinity": (of(FEATURES, whole(INFINITE)), "not a TFDS features.json"),
@@ -85,7 +86,10 @@ ALL: dict[str, Row] = {  # no episode can be used
     "info cut short": (of(INFO, cut(1)), "Invalid JSON"),
     "another container": (of(INFO, whole('{"fileFormat": "riegeli"}')), "riegeli files"),
     "records left out": (of(INFO, swap('"3"', '"2"')), r"has 3 records, dataset_info\.json says 2"),
-    "no shard": (of(SHARD, Path.unlink), "holds no TFRecord file"),
+    "no shard": (
+        of(SHARD, Path.unlink),
+        r"no file that dataset_info\.json names — .* like toy-train\.",
+    ),
     "an empty shard": (of(SHARD, cut(0)), "holds no readable episode"),
     "a packed shard": (of(SHARD, whole(b"\x1f\x8b" + bytes(40))), "gzip-compressed"),
     "zeros": (of(SHARD, whole(bytes(400))), "holds no readable episode"),
@@ -130,7 +134,7 @@ def flagged(last_action: tuple[float, float] | None = None, first=(0,), last=(CO
 
 
 def folder_of(path: Path, *records: dict) -> Path:
-    return write(path / "toy", {"toy-train.tfrecord-00000-of-00001": list(records)}, STEPS | FLAGS)
+    return write(path / "toy", {SHARD: list(records)}, STEPS | FLAGS)
 
 
 @pytest.mark.parametrize("padding", [(0.0, 0.0), (np.nan, np.nan), (np.inf, 1.0)])

@@ -1,6 +1,5 @@
 """Where the records of a file lie, and remote files read a range at a time."""
 
-import json
 import threading
 import tracemalloc
 from functools import partial
@@ -220,22 +219,6 @@ def test_a_driver_that_is_missing_is_named_with_its_install_line(monkeypatch, pr
     monkeypatch.setattr(fsspec.core, "url_to_fs", missing)
     with pytest.raises(MissingDependencyError, match=install):
         RLDS.index(f"{protocol}://bucket/{package}/x")
-
-
-@pytest.mark.parametrize(
-    ("name", "split"),
-    [
-        ("toy-test-hard.tfrecord-00000-of-00001", "test-hard"),
-        ("toy-val-00000-of-00001.tfrecord", "val"),
-        ("val_00000-of-00001.tfrecord", "val"),
-        ("toy-val.tfrecord", "val"),
-    ],
-)
-def test_a_split_is_told_by_the_name_of_its_file(tmp_path, name, split):
-    folder = dataset(tmp_path / "d", 2)
-    shard(folder).rename(folder / name)
-    (folder / "dataset_info.json").write_text(json.dumps({"name": "toy", "splits": []}))
-    assert RLDS.episode_ids(str(folder)) == [f"{split}/000000", f"{split}/000001"]
 
 
 # -- shards fetched while they are read
