@@ -73,21 +73,22 @@ class RosbagSource:
         """
         uri = as_text(uri)
         match, segments = PART.fullmatch(episode_id), embodiment.source.segments
+        part_of = match["bag"] if match and segments else ""
         # listed once: thousands of bags, each read on its own
         root, bags = self._found.get(uri) or self._list(uri)
-        if episode_id not in bags and (match is None or match["bag"] not in bags):
+        if bags.keys().isdisjoint((episode_id, part_of)):
             root, bags = self._list(uri)
-        if episode_id in bags:
-            path, *parts = bags[episode_id]
-            bag = Bag(path, root, parts)
-            if segments:
-                bag = parted(bag, embodiment, segments)[0]
-            return _EpisodeReading(bag, episode_id, embodiment).episode()
-        if not segments or not match or match["bag"] not in bags:
+        name = episode_id if episode_id in bags else part_of
+        if name not in bags:
             raise SourceError(uri, f"has no bag {episode_id!r}", f"it has {', '.join(list(bags)[:10])}")
-        name, number = match["bag"], int(match["number"])
         path, *parts = bags[name]
-        bag, table = parted(Bag(path, root, parts), embodiment, segments)
+        bag = Bag(path, root, parts)
+        if not segments:
+            return _EpisodeReading(bag, episode_id, embodiment).episode()
+        bag, table = parted(bag, embodiment, segments)
+        if not match or name == episode_id:
+            return _EpisodeReading(bag, episode_id, embodiment).episode()
+        number = int(match["number"])
         if number >= len(table.segments):
             held = f"{name} holds {_part_id(name, 0)} to {_part_id(name, len(table.segments) - 1)}"
             raise SourceError(uri, f"has no episode {episode_id!r}", held)
@@ -96,8 +97,8 @@ class RosbagSource:
     def _list(self, uri: str) -> tuple[Path, dict[str, list[Path]]]:
         """Return the place of the recordings and the bags in it, and remember both for `read`."""
         path = existing_path(uri)
-        if path.is_file() and path.name == "metadata.yaml":
-            raise SourceError(uri, "only describes a bag", f"give the bag's folder, {path.parent}")
+        if path.name == "metadata.yaml":
+            path = path.parent
         bags = find_bags(path)
         if not bags:
             remedy = "expected .bag, .mcap, .db3, or folders with a metadata.yaml"
