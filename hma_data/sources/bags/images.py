@@ -54,6 +54,7 @@ START_CODES = (b"\x00\x00\x01", b"\x00\x00\x00\x01")  # of H.264 and H.265 as a 
 # The first two bytes of H.265's parameter sets, of its delimiter and of messages before them.
 H265_HEADS = (b"\x40\x01", b"\x42\x01", b"\x44\x01", b"\x46\x01", b"\x4e\x01")
 AV1_SEQUENCE = 1  # type of the unit that holds a sequence header
+AV1_DELIMITER = b"\x12\x00"  # the unit before it, where it is stored
 # What FFmpeg logs where a reference image is missing, and the level of that message.
 MISSING = {"h264": ("DEBUG", "Frame num gap"), "h265": ("ERROR", "Could not find ref")}
 
@@ -229,10 +230,8 @@ def _pixels(message: Any, where: str, pixel: int) -> Images:
     fault = f"an image of {width}×{height} in {stated}"
     if (shared and width % 2) or (planar and height % 2):
         raise EpisodeError(where, f"{fault} does not have even sides")
-    if step < row or len(flat) < step * (rows - 1) + row:
+    if step < row or len(flat) < step * rows:
         raise EpisodeError(where, f"{fault} has {len(flat):,} bytes, rows of {step}")
-    if len(flat) < step * rows:  # the last row may end with its last pixel
-        flat = np.concatenate([flat, np.zeros(step * rows - len(flat), np.uint8)])
     pixels = np.ascontiguousarray(flat[: step * rows].reshape(rows, step)[:, :row])
     return pixels.reshape(rows, width, pixel)
 
@@ -291,22 +290,9 @@ def _vp9_begins(data: bytes) -> bool:
 
 
 def _av1_begins(data: bytes) -> bool:
-    """Check for a sequence header, which comes with every key frame: AV1 specification, section 5.3."""
-    at = 0
-    while at < len(data):
-        kind, extended, sized = data[at] >> 3 & 15, data[at] & 4, data[at] & 2
-        if kind == AV1_SEQUENCE:
-            return True
-        if not sized:
-            return False
-        at += 2 if extended else 1
-        size = shift = 0
-        more = True
-        while more and at < len(data):
-            size |= (data[at] & 0x7F) << shift
-            more, at, shift = bool(data[at] & 0x80), at + 1, shift + 7
-        at += size
-    return False
+    """Check for a sequence header, with which every key frame begins: AV1 specification, section 7.5."""
+    first = data.removeprefix(AV1_DELIMITER)[:1]
+    return bool(first) and first[0] >> 3 & 15 == AV1_SEQUENCE
 
 
 class VideoDecoder:
