@@ -31,7 +31,7 @@ from hma_data.sources.bags.container import (
 )
 from hma_data.sources.bags.mcap import MAGIC as MCAP_MAGIC
 from hma_data.sources.bags.mcap import McapFile
-from hma_data.sources.bags.ros_files import SQLITE_MAGIC, Ros1File, SqliteFile
+from hma_data.sources.bags.ros_files import ROS1_MAGIC, SQLITE_MAGIC, Ros1File, SqliteFile
 from hma_data.sources.common.places import file_fingerprint, first_bytes, natural, require_inside
 from hma_data.storage.fetch import mark
 from hma_data.storage.remote import RemotePath, is_remote
@@ -238,15 +238,14 @@ def is_bag_folder(path: Path) -> bool:
 
 def _container(path: Path, chunks: Chunks) -> Container:
     magic = first_bytes(path, 16)
-    if magic.startswith(b"#ROSBAG"):
+    if magic.startswith(ROS1_MAGIC):
         return Ros1File(path, chunks)
     if magic.startswith(MCAP_MAGIC):
         return McapFile(path, chunks)
     if magic.startswith(SQLITE_MAGIC):
         return SqliteFile(path)
-    raise damaged(
-        path, f"begins with {magic[:8]!r}, which is not how a ROS 1 bag, MCAP or sqlite3 file begins"
-    )
+    known = "a ROS 1 bag (format 2.0), MCAP or sqlite3 file"
+    raise damaged(path, f"begins with {magic[:13]!r}, which is not how {known} begins")
 
 
 def _metadata(folder: Path) -> dict[str, Any]:
@@ -266,8 +265,8 @@ def _kept_information(where: Path, size: int, changed: int) -> dict[str, Any]:
 def _information(where: Path) -> dict[str, Any]:
     values = read_yaml(where, EpisodeError)
     information = values.get("rosbag2_bagfile_information") if isinstance(values, dict) else None
-    if not isinstance(information, dict):
-        raise EpisodeError(where, "holds no rosbag2_bagfile_information", "run ros2 bag reindex")
+    if not isinstance(information, dict) or not isinstance(information.get("relative_file_paths"), list):
+        raise EpisodeError(where, "names no files of a bag", "run ros2 bag reindex")
     return information
 
 
@@ -276,9 +275,7 @@ def _listed(folder: Path, metadata: dict[str, Any]) -> tuple[list[Path], tuple[s
 
     A recorder that was killed leaves a metadata.yaml that names only some of the parts.
     """
-    where, names = folder / "metadata.yaml", metadata.get("relative_file_paths")
-    if not isinstance(names, list) or not names:
-        raise EpisodeError(where, "relative_file_paths names no files", "run ros2 bag reindex")
+    where, names = folder / "metadata.yaml", metadata["relative_file_paths"]
     paths = [_named_file(folder, PurePosixPath(str(name)).name, where) for name in names]
     named = set(paths)
     others = [path for path in folder.iterdir() if path not in named and _is_bag_name(path.name)]

@@ -7,6 +7,7 @@ used, and then those of the newest release. A message of any encoding is read th
 
 import dataclasses
 import json
+import re
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 from importlib import import_module
@@ -20,7 +21,7 @@ from hma_data.sources.bags.container import Channel, Data
 from hma_data.storage.kinds import one_line
 
 Decode = Callable[[Data], Any]
-IDL_SEPARATOR = "=" * 80 + "\n"
+IDL_SEPARATOR = "=" * 80 + r"\nIDL: .*\n"  # between the types of a definition
 TIME_FIELDS = (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos"))
 PLAIN_CDR = 1  # the last of RTPS's kinds of encapsulation that is plain; then parameter lists and XCDR2
 WELL_KNOWN = "google/protobuf/"
@@ -115,12 +116,8 @@ def _definitions(channel: Channel, kind: str) -> Any:
         return get_types_from_msg(text, kind)
     if channel.schema_encoding != "ros2idl":
         raise ValueError(f"definitions written as {channel.schema_encoding!r} cannot be read")
-    if not text.startswith(IDL_SEPARATOR):
-        return get_types_from_idl(text)
-    types: dict[str, Any] = {}
-    for part in text.split(IDL_SEPARATOR)[1:]:
-        types |= get_types_from_idl(part.partition("\n")[2])  # the first line names the type
-    return types
+    parts = filter(None, re.split(IDL_SEPARATOR, text))
+    return {name: fields for part in parts for name, fields in get_types_from_idl(part).items()}
 
 
 # -- any message

@@ -52,8 +52,6 @@ class Ros1File(IndexedFile):
     def _view(self, file: BinaryIO, at: int, end: int | None = None) -> View:
         """See IndexedFile."""
         header, start, end = _record(_whole(file), at)
-        if _number(header, "op") != CHUNK:
-            raise ValueError(f"there is no chunk at {at:,}, where the index says one is")
 
         def unpacked() -> bytes:
             data = FileView(file, start, end)[0 : end - start]
@@ -71,13 +69,7 @@ class Ros1File(IndexedFile):
                 yield StoredMessage(_number(header, "conn"), _time(header, "time"), place, start, end)
 
     def _make_index(self, file: BinaryIO) -> FileIndex:
-        magic = file.read(len(ROS1_MAGIC))
-        if magic != ROS1_MAGIC:
-            shown = magic.split(b"\n")[0].decode("ascii", "replace")
-            raise damaged(self.path, f"begins with {shown!r}, not as a ROS 1 bag")
         header, _, _ = _record(_whole(file), len(ROS1_MAGIC))
-        if header.get("encryptor"):
-            raise ValueError("it is encrypted")
         at = _number(header, "index_pos")
         if not at:
             return self._index_of_chunks(file)
@@ -124,9 +116,7 @@ def _header(data: Data) -> Header:
     while at < len(data):
         start = at + 4
         at = start + int.from_bytes(data[at:start], "little")
-        name, equals, value = bytes(data[start:at]).partition(b"=")
-        if not equals:
-            raise ValueError("a header's field has no name")
+        name, _, value = bytes(data[start:at]).partition(b"=")
         header[name.decode("ascii")] = value
     return header
 

@@ -117,7 +117,7 @@ class Scene:
         """
         path = self.folder / camera / STAMPS
         found = read_dict(path).get("color")
-        values = _numbers(found, path, "color", lists=True)
+        values = _numbers(found, path, "color")
         if values.ndim != 1 or values.dtype.kind not in "iu" or not len(values):
             raise EpisodeError(path, "its color holds no times in whole milliseconds")
         return values.astype(np.int64)
@@ -140,6 +140,10 @@ class Scene:
         values = [_numbers(_field(row, field, path), path, key) for _, row in rows]
         if len({value.shape for value in values}) > 1:
             raise EpisodeError(path, f"{key} changes its number of values")
+        if values[0].size > MAX_WIDTH:
+            raise EpisodeError(
+                path, f"{key} has {values[0].size:,} values per sample, more than {MAX_WIDTH:,}"
+            )
         times = np.array([stamp for stamp, _ in rows], np.float64) / 1e3
         stacked = np.stack(values).reshape(len(rows), -1)
         return (times[:-1], stacked[1:]) if ahead and len(rows) > 1 else (times, stacked)
@@ -236,14 +240,11 @@ def _is_numeric(value: Any) -> bool:
     return isinstance(value, int | float | np.ndarray)
 
 
-def _numbers(value: Any, path: Path, key: str, lists: bool = False) -> Array:
-    """Return a sample's numbers as an array; a list inside a list, which could be huge, is refused."""
-    if not isinstance(value, np.ndarray) and not _is_numeric(value):
+def _numbers(value: Any, path: Path, key: str) -> Array:
+    """Return numbers as an array; a list inside a list is refused."""
+    if not _is_numeric(value):
         raise EpisodeError(path, f"{key} holds {type(value).__name__} values, not numbers")
-    found = np.asarray(value)
-    if found.size > MAX_WIDTH and not lists:
-        raise EpisodeError(path, f"{key} has {found.size:,} values per sample, more than {MAX_WIDTH:,}")
-    return found
+    return np.asarray(value)
 
 
 def _json(path: Path) -> dict[str, Any]:
