@@ -71,23 +71,19 @@ def export(
     total = sum(shards.manifest.splits[name]["frames"] for name in places)
     done = 0
     for name, place in places.items():
-        for rows in _export_split(shards, name, place, number):
-            done += rows
-            on_progress(done, total)
+        try:
+            with new_folder(place) as part:
+                for rows in _write_rows(shards, name, part, number):
+                    done += rows
+                    on_progress(done, total)
+        except OSError as fault:
+            remedy = "free space or choose another --out"
+            raise OutputError(place, f"cannot be written: {fault.strerror or fault}", remedy) from fault
     return list(places.values())
 
 
-def _export_split(shards: ShardSet, split: str, place: Path, camera: int) -> Iterator[int]:
-    """Write one split; yield the number of rows of each episode."""
-    try:
-        with new_folder(place) as part:
-            yield from _write_rows(shards, split, part, camera)
-    except OSError as fault:
-        remedy = "free space or choose another --out"
-        raise OutputError(place, f"cannot be written: {fault.strerror or fault}", remedy) from fault
-
-
 def _write_rows(shards: ShardSet, split: str, part: Path, camera: int) -> Iterator[int]:
+    """Write one split; yield the number of rows of each episode."""
     spec = shards.spec
     name = shards.manifest.cameras[camera]
     columns = [column for column in shards.columns([name]) if column != "episode_index"]

@@ -14,7 +14,7 @@ real frame change no prediction before them.
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -169,12 +169,9 @@ def pieces(pauses: Mapping[int, int], length: int, stride: int, frame_stride: in
 
 def _row_groups(per_shard: list[tuple[int, ...]]) -> tuple[Ints, Ints]:
     """Return the first rows (G+1,) and the places (G, 2) of all row groups of a split."""
-    sizes = np.array([rows for groups in per_shard for rows in groups], np.int64)
-    edges = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-    counts = np.array([len(groups) for groups in per_shard], np.int64)
-    shard = np.repeat(np.arange(len(per_shard)), counts)
-    first = np.repeat(np.cumsum(counts) - counts, counts)
-    return edges, np.stack([shard, np.arange(len(sizes)) - first], axis=1).astype(np.int64)
+    edges = np.cumsum([0, *chain(*per_shard)], dtype=np.int64)
+    places = [(shard, group) for shard, groups in enumerate(per_shard) for group in range(len(groups))]
+    return edges, np.array(places, np.int64).reshape(-1, 2)
 
 
 def _pieces(shards: ShardSet, split: str, episodes: EpisodeIndex, stride: int) -> tuple[Ints, Ints, Ints]:
