@@ -272,12 +272,6 @@ def _rate(rate: float) -> str:
     return f"{rate:.2g}" if rate < 1 else f"{rate:,.{1 if rate < 10 else 0}f}"
 
 
-def human_times(elapsed: float, left: float | None) -> str:
-    """Return the elapsed and the remaining time as text; a remaining time that is unknown is left out."""
-    rest = f", {_whole_seconds(left)} left" if left is not None else ""
-    return f"{_whole_seconds(elapsed)} so far{rest}"
-
-
 def _whole_seconds(seconds: float) -> str:
     return f"{seconds:.0f} s" if round(seconds) < 60 else human_seconds(seconds)
 
@@ -309,8 +303,9 @@ class _Lines:
         self._shown, self._is_told = time.monotonic(), True
         rate = (self._done - first) / max(self._shown - begun, 1e-9)
         missing = self._total - self._done
-        left = missing / rate if rate > 0 and missing > 0 else None
         amount = _amount(self._done, self._total, rate, self._unit)
         words = f", {self._extra}" if self._extra else ""
-        times = human_times(self._shown - self._start, left)
+        times = f"{_whole_seconds(self._shown - self._start)} so far"
+        if rate > 0 and missing > 0:
+            times += f", {_whole_seconds(missing / rate)} left"
         print(f"{self._text}: {amount}, {times}{words}", file=sys.stderr, flush=True)

@@ -252,14 +252,12 @@ def split(
         by: what stays together: episode (and its recording), instruction or source.
 
     Raises:
-        UsageError: a fraction or `by` is not allowed.
+        UsageError: the fraction is not allowed.
         OutputError: `out` holds something else, or another job is writing it.
     """
     shards = ShardSet(folder)
     _check_out(out, [folder])
     rows = _rows(shards)
-    if by not in ("episode", "instruction", "source"):
-        raise UsageError("--by", f"{by!r} is not known", "allowed: episode, instruction, source")
     settings = replace(_settings(shards), val_fraction=val_fraction, seed=seed)
     if settings.limit is not None and settings.limit < len(rows):
         settings = replace(settings, limit=None)  # the set was extended beyond its limit

@@ -6,9 +6,8 @@ from contextlib import contextmanager
 from typing import Any
 
 from hma_data.errors import HMAError, HubError
-from hma_data.storage.fetch import causes, hidden, without_secrets
+from hma_data.storage.fetch import BUSY, causes, hidden, without_secrets
 
-TRANSIENT = (408, 429, 500, 502, 503, 504)
 LOG_IN = "log in with hf auth login, or set HF_TOKEN"
 RUN_AGAIN = "run the same command again to continue"
 LONGEST_WAIT = 300.0  # seconds; the hub counts requests over five minutes
@@ -36,7 +35,7 @@ def explain(where: str, fault: BaseException) -> HubError:
         return HubError(where, f"the hub refuses the card: {shown(str(fault).partition('\n')[2])}", remedy)
     if isinstance(fault, errors.LocalEntryNotFoundError) and isinstance(cause, errors.HfHubHTTPError):
         return explain(where, cause)
-    away = errors.OfflineModeIsEnabled | httpx.ConnectError | httpx.TimeoutException
+    away = _away()
     plain: tuple[tuple[Any, str, str], ...] = (
         (errors.GatedRepoError, "is gated", f"ask for access on its page, then {LOG_IN}"),
         (errors.RevisionNotFoundError, "has no such revision", "name a branch, tag or commit of it"),
@@ -101,7 +100,7 @@ def waiting(fault: BaseException, attempt: int) -> float | None:
     if response is None:
         cut = (httpx.RemoteProtocolError, httpx.ReadError, httpx.WriteError)
         return float(2**attempt) if any(isinstance(item, cut) for item in causes(fault)) else None
-    if response.status_code not in TRANSIENT:
+    if response.status_code not in BUSY:
         return None
     stated = response.headers.get("retry-after", "")
     limit = re.search(r";\s*t\s*=\s*(\d+)", response.headers.get("ratelimit", ""))
@@ -121,11 +120,15 @@ def is_missing(fault: HubError) -> bool:
 
 def is_away(fault: HubError) -> bool:
     """Check whether the hub is out of reach."""
+    return isinstance(fault.__cause__, _away())
+
+
+def _away() -> Any:
+    """Return the client's errors of a hub that is out of reach."""
     import httpx
     from huggingface_hub import errors
 
-    away = errors.OfflineModeIsEnabled | httpx.ConnectError | httpx.TimeoutException
-    return isinstance(fault.__cause__, away)
+    return errors.OfflineModeIsEnabled | httpx.ConnectError | httpx.TimeoutException
 
 
 def is_of_xet(fault: BaseException) -> bool:

@@ -187,6 +187,8 @@ class Manifest:
         if not path.is_file():
             if not isinstance(folder, RemotePath) and (found := misplaced(folder, "a shard set")):
                 raise ShardError(folder, *found)
+            if not folder.is_dir():
+                raise ShardError(folder, "is not a folder", "name the --out folder of an hma convert")
             remedy = f"run the same hma convert again to finish it; if the manifest was lost, {restat}"
             raise ShardError(folder, f"has no {MANIFEST}: its conversion has not finished", remedy)
         return cls.from_text(path.read_bytes(), path, restat)

@@ -25,10 +25,9 @@ import pyarrow.parquet as pq
 
 from hma_data.arrays import Array, Ints
 from hma_data.errors import ShardError, UsageError
-from hma_data.shards.manifest import EPISODES, MANIFEST, QUARANTINE, Manifest, ShardFile, restat_remedy
+from hma_data.shards.manifest import EPISODES, QUARANTINE, Manifest, ShardFile, restat_remedy
 from hma_data.shards.schema import flag_pauses, mask_columns, to_numpy, token_column
 from hma_data.storage.files import cache_folder, file_sha256, parse_json, part_of
-from hma_data.storage.kinds import misplaced
 from hma_data.storage.paths import StrPath
 from hma_data.storage.remote import RemotePath, parquet_file, place, remote_file
 
@@ -75,10 +74,6 @@ class ShardSet:
 
     def __init__(self, folder: StrPath, cache: bool = True) -> None:
         self.folder = place(folder)
-        if not (self.folder / MANIFEST).is_file() and not self.folder.is_dir():
-            found = misplaced(self.folder, "a shard set")
-            remedy = "name the --out folder of an hma convert"
-            raise ShardError(self.folder, *(found or ("is not a folder", remedy)))
         self._cache = cache
         self.manifest = Manifest.load(self.folder)
         self.embodiment = self.manifest.embodiment

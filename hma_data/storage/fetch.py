@@ -29,7 +29,7 @@ _ANSWERS_LATER = {
     errno.ETIMEDOUT,
 }  # fmt: skip
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
-_BUSY = {408, 425, 429, 500, 502, 503, 504}
+BUSY = {408, 425, 429, 500, 502, 503, 504}
 _UNREACHABLE = {
     "ConnectionRefusedError", "ClientConnectorError", "ConnectionTimeoutError",  # aiohttp
     "EndpointConnectionError", "ConnectTimeoutError",  # botocore
@@ -79,7 +79,7 @@ def may_pass(fault: BaseException) -> bool:
     if isinstance(fault, (*ABSENT, PermissionError, ImportError)):
         return False
     if status := _status(fault):
-        return status in _BUSY
+        return status in BUSY
     if isinstance(fault, OSError) and worth_another_try(fault):
         return True
     return bool(_kinds(fault) & _OF_THE_NETWORK)

@@ -2,29 +2,20 @@
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import h5py
 import numpy as np
-import pyarrow.compute as pc
-import pyarrow.parquet as pq
 import pytest
 
-from hma_data.conversion import rewrite
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.conversion.rewrite import merge, split
-from hma_data.errors import OutputError, ShardError, UsageError
+from hma_data.errors import ShardError, UsageError
 from hma_data.registry.embodiment import Embodiment
-from hma_data.shards.manifest import Manifest
-from hma_data.shards.memmap import export
 from hma_data.shards.reader import ShardSet
-from hma_data.shards.schema import read_footer, to_arrow, to_numpy
-from hma_data.shards.stats import Stats
 from hma_data.shards.verify import verify
 from tests.conftest import ARM_YAML, BlockTokenizer, contents, toy_shards, write_toy
-from tests.data.shards.test_shards_verify import derive_anew
 
 SMALL = Settings(val_fraction=0.3, shard_frames=40)
 
@@ -86,8 +77,6 @@ def test_split_by_instruction_keeps_equal_instructions_together(made: Path, tmp_
 def test_split_refuses_what_it_cannot_do(made: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="must be at least 0 and below 1"):
         split(made, tmp_path / "a", val_fraction=1.5)
-    with pytest.raises(UsageError, match="instruction"):
-        split(made, tmp_path / "a", by="colour")
     with pytest.raises(UsageError, match="holds the shard set"):
         split(made, made)
     with pytest.raises(UsageError, match="holds the shard set"):
@@ -118,32 +107,6 @@ def test_merge_refuses_to_train_on_what_another_set_holds_out(made: Path, tmp_pa
     with pytest.raises(ShardError, match=r"all: would have \d+ episodes in train that are also in val"):
         merge([made, tmp_path / "again"], tmp_path / "all")
     assert not (tmp_path / "all").exists()
-
-
-def test_merged_statistics_are_those_of_all_train_rows(made: Path, tmp_path: Path) -> None:
-    other = make(tmp_path / "other", [11, 12, 13])
-    manifest = merge([made, other], tmp_path / "all", workers=2)
-    rows = []
-    for folder in (made, other):
-        shards = ShardSet(folder)
-        for row in shards.episodes.filter(pc.equal(shards.episodes["split"], "train")).to_pylist():
-            rows.append(shards.episode_rows(row["episode_index"], ["action"])["action"])
-    values = np.concatenate(rows).astype(np.float64)
-    np.testing.assert_allclose(manifest.stats["action"]["mean"], values.mean(0), rtol=1e-12)
-    np.testing.assert_allclose(manifest.stats["action"]["std"], values.std(0), rtol=1e-12)
-    assert manifest.stats["action"]["count"] == len(values)
-
-
-def test_every_shard_takes_its_episodes_from_columns_of_one_chunk(made, tmp_path, monkeypatch) -> None:
-    plain, chunks = rewrite._make_shard, []
-
-    def make_shard(job, *given) -> None:
-        chunks.extend(column.num_chunks for column in job.episodes.columns)
-        plain(job, *given)
-
-    monkeypatch.setattr(rewrite, "_make_shard", make_shard)
-    merge([made, made], tmp_path / "all")
-    assert len(chunks) > 1 and set(chunks) == {1}
 
 
 def test_merge_gives_the_same_bytes_wherever_the_sets_lie(made: Path, tmp_path: Path) -> None:
@@ -198,14 +161,6 @@ def test_a_set_without_states_merges_with_one_that_has_them(tmp_path: Path) -> N
                 assert found[f"{place}/{name}"][1:] == stored[1:]
 
 
-def test_merge_refuses_a_folder_that_holds_something_else(made: Path, tmp_path: Path) -> None:
-    (tmp_path / "all").mkdir()
-    (tmp_path / "all" / "thesis.txt").write_text("mine")
-    with pytest.raises(OutputError, match=r"thesis\.txt"):
-        merge([made], tmp_path / "all")
-    assert contents(tmp_path / "all") == {"thesis.txt": b"mine"}
-
-
 def test_several_cameras_and_strided_rows_survive(tmp_path: Path) -> None:
     settings = Settings(frames="strided", cameras=("top", "side"), val_fraction=0.3, shard_frames=20)
     folder = make(tmp_path / "set", [14, 15, 16, 17], settings)
@@ -228,48 +183,3 @@ def test_a_set_extended_beyond_its_limit_is_split_whole(tmp_path: Path) -> None:
     assert verify(tmp_path / "again") == []
     assert episodes(tmp_path / "again") == episodes(tmp_path / "set")
     assert len(episodes(tmp_path / "set")) == 4
-
-
-def test_masks_go_along(tmp_path: Path) -> None:
-    yaml = ARM_YAML + "sync: {beyond: mask, max_skew_ms: 50}\n"
-    folder = make(tmp_path / "set", [14, 15, 16], yaml=yaml)
-    mask_some(folder)
-    assert verify(folder) == []
-    merge([folder], tmp_path / "one")
-    split(tmp_path / "one", tmp_path / "two", val_fraction=0.5)
-    for other in ("one", "two"):
-        assert verify(tmp_path / other) == []
-        mine, theirs = (
-            {row["id"]: s.episode_rows(row["episode_index"], s.columns()) for row in s.episodes.to_pylist()}
-            for s in (ShardSet(folder), ShardSet(tmp_path / other))
-        )
-        for name, columns in mine.items():
-            assert not columns["action_known"][3]
-            for column in ("action", "action_known", "tokens"):
-                np.testing.assert_array_equal(theirs[name][column], columns[column])
-    flat = export(tmp_path / "one", tmp_path / "flat")
-    known = np.concatenate([np.fromfile(place / "hma" / "action_known.bin", bool) for place in flat])
-    assert (~known).sum() == len(mine)
-
-
-def mask_some(folder: Path) -> None:
-    """Row 3 of every episode is unknown; footers and manifest follow."""
-    for shard in Manifest.load(folder).shards:
-        path = folder / shard.path
-        said, _ = read_footer(path)
-        table = pq.read_table(path)
-        unknown = table["frame_index"].to_numpy() == 3
-        actions = to_numpy(table["action"]).copy()
-        actions[unknown] = 0
-        for column, values in (("action", actions), ("action_known", ~unknown)):
-            place = table.schema.get_field_index(column)
-            field = table.schema.field(place)
-            table = table.set_column(place, field, to_arrow(field, values))
-        stats = Stats.empty(3)
-        for row in said.episodes:
-            own = slice(row.row_start, row.row_start + row.rows)
-            stats.merge(Stats.of(actions[own][~unknown[own]]))
-        with pq.ParquetWriter(path, table.schema) as writer:
-            writer.write_table(table, row_group_size=2048)
-            writer.add_key_value_metadata(replace(said, stats={"action": stats}).to_metadata())
-    derive_anew(folder)
