@@ -237,16 +237,15 @@ def test_shares_run_side_by_side_and_one_of_them_finishes(toy_arm, toy_file, out
 @pytest.mark.parametrize("out", [S3], indirect=True)
 def test_a_job_killed_while_a_shard_goes_to_s3_is_continued(toy_file, out, whole, tmp_path, proxy) -> None:
     def kill(method: str, path: str, number: int) -> str | None:
-        if method != "PUT" or f"shard-0000{wanted}" not in path:
+        if method != "PUT" or "shard-00001" not in path:
             return None
         process.kill()
         return "drop"
 
     proxy.trouble = kill
-    for wanted in (1, 2):  # noqa: B007
-        process = start(tmp_path, toy_file, out, workers=0)
-        _, errors = process.communicate(timeout=200)
-        assert process.returncode == -signal.SIGKILL, errors
+    process = start(tmp_path, toy_file, out, workers=0)
+    _, errors = process.communicate(timeout=200)
+    assert process.returncode == -signal.SIGKILL, errors
     assert "manifest.json" not in files(out)
     proxy.trouble = lambda *asked: None
     ends(start(tmp_path, toy_file, out))

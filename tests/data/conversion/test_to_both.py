@@ -38,7 +38,7 @@ def one_run(
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "kind, frames, tokenizer",
-    [("rlds", "all", "fsq-8"), ("hdf5", "all", "vae-8"), ("bag", "strided", "raw-64:antialias")],
+    [("hdf5", "all", "fsq-8"), ("bag", "strided", "raw-64:antialias")],
 )
 def test_one_pass_writes_the_bytes_of_two_runs(kind, frames, tokenizer, tmp_path) -> None:
     data, robot = RECORDINGS[kind](tmp_path)
