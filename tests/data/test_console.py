@@ -68,15 +68,14 @@ def test_brackets_in_tables_are_text(capsys: pytest.CaptureFixture[str]) -> None
     assert all(words in out for words in ("key [unit]", "pose[rad]", "in [a]"))
 
 
-@pytest.mark.parametrize("width", [80, 100])
-def test_a_table_too_wide_for_a_terminal_shows_all_its_figures(width, monkeypatch, capsys) -> None:
-    monkeypatch.setenv("COLUMNS", str(width))
+def test_a_table_too_wide_for_a_terminal_shows_all_its_figures(monkeypatch, capsys) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.setattr("sys.stdout.isatty", lambda: True)
     figures = [f"figure {i}" for i in range(14)]
     row = ["runs/first/checkpoints/step-00000620", "arm", *(1000.5 + i for i in range(14))]
     console.print_table(["checkpoint", "robot", *figures], [row])
     out = re.sub(r"\x1b\[\d*m", "", capsys.readouterr().out)  # bold names
-    assert max(map(len, out.splitlines())) <= width
+    assert max(map(len, out.splitlines())) <= 80
     words = " ".join(out.split())
     assert all(f"figure {i}: {1000.5 + i:,.4g}" in words for i in range(14))
 

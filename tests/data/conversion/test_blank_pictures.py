@@ -108,9 +108,12 @@ def test_the_yaml_chooses_between_refusing_and_flagging(tmp_path, block_tokenize
     assert "keeps such episodes" in next(iter(summary.reasons))
 
 
-def test_a_share_of_repeated_pictures_below_the_limit_passes(tmp_path, block_tokenizer) -> None:
+def test_a_share_of_repeated_pictures_below_the_limit_passes_and_doctor_says_nothing(
+    tmp_path, block_tokenizer
+) -> None:
     summary = converted(tmp_path, {"a": pictures("repeated")}, "{repeated_share: 0.7}", block_tokenizer)
     assert summary.flags == {}
+    assert not [one for one in examine(tmp_path / "out") if one.check in ("blank", "still")]
 
 
 def test_a_second_camera_counts_where_it_is_converted(tmp_path, block_tokenizer) -> None:
@@ -187,8 +190,3 @@ def test_doctor_names_the_blank_and_still_episodes_that_were_kept(tmp_path, bloc
         assert (found[check]["severity"], found[check]["key"]) == ("warn", "top")
         assert found[check]["numbers"]["episodes"] == [episode]
         assert found[check]["message"].endswith(f"throughout in 1 of 4 episodes: {episode}")
-
-
-def test_doctor_of_sound_shards_says_nothing_of_pictures(tmp_path, block_tokenizer) -> None:
-    converted(tmp_path, {"a": pictures("good")}, "{}", block_tokenizer)
-    assert not [one for one in examine(tmp_path / "out") if one.check in ("blank", "still")]

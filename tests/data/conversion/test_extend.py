@@ -207,16 +207,6 @@ def test_files_of_a_hub_and_of_macos_may_lie_beside_a_set(tmp_path: Path, toy_ar
     assert verify(out) == []
 
 
-def test_a_published_set_is_a_set_to_extend(tmp_path: Path, toy_arm: Embodiment) -> None:
-    write_toy(tmp_path / "toy.hdf5", [20, 21])
-    convert(toy_arm, tmp_path / "toy.hdf5", BlockTokenizer(), tmp_path / "out")
-    push_data(tmp_path / "out", tmp_path / "pushed")
-    assert (tmp_path / "pushed/README.md").is_file()
-    write_toy(tmp_path / "toy.hdf5", [20, 21, 22])
-    convert(toy_arm, tmp_path / "toy.hdf5", BlockTokenizer(), tmp_path / "pushed", extend=True)
-    assert verify(tmp_path / "pushed") == []
-
-
 @pytest.mark.parametrize("options", [{}, {"extend": True}, {"overwrite": True}])
 def test_a_foreign_file_in_a_set_is_named_and_kept(options, tmp_path, toy_arm) -> None:
     recording, out = tmp_path / "toy.hdf5", tmp_path / "out"

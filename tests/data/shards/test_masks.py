@@ -11,10 +11,12 @@ import pytest
 
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
+from hma_data.conversion.rewrite import merge, split
 from hma_data.errors import SourceError
 from hma_data.inspection.inspect import inspect_recording
 from hma_data.loading.dataset import MixtureDataset, WindowDataset
 from hma_data.registry.embodiment import Embodiment
+from hma_data.shards.memmap import export
 from hma_data.shards.reader import ShardSet
 from hma_data.shards.schema import flag_counts, flag_pauses, flag_totals, flags_text, mask_columns
 from hma_data.shards.verify import check_shard, verify
@@ -74,6 +76,20 @@ def test_an_episode_is_refused_or_its_old_commands_are_masked(bag, shards, tmp_p
     states = np.flatnonzero(~rows["state_known"])
     assert states.tolist() == [21, 22, 23, 24] and not rows["state"][states].any()
     assert verify(shards) == []
+
+
+def test_masks_go_along_into_sets_made_of_the_set_and_into_flat_files(shards: Path, tmp_path: Path) -> None:
+    merge([shards], tmp_path / "one")
+    split(tmp_path / "one", tmp_path / "two", seed=1)
+    columns = ShardSet(shards).columns()
+    wanted = ShardSet(shards).episode_rows(0, columns)
+    for name in ("one", "two"):
+        assert verify(tmp_path / name) == []
+        for column, values in ShardSet(tmp_path / name).episode_rows(0, columns).items():
+            np.testing.assert_array_equal(values, wanted[column])
+    (flat,) = export(tmp_path / "two", tmp_path / "flat")
+    for mask in ("action_known", "state_known"):
+        np.testing.assert_array_equal(np.fromfile(flat / f"hma/{mask}.bin", bool), wanted[mask])
 
 
 def test_skew_is_told_by_topic(bag: Path, shards: Path) -> None:

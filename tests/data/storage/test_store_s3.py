@@ -109,14 +109,6 @@ def test_a_bucket_that_is_not_there_is_named(toy_arm, toy_recording, proxy) -> N
         ShardSet("s3://no-such-bucket/set")
 
 
-def test_refused_credentials_are_one_error(toy_arm, toy_recording, out, proxy) -> None:
-    proxy.trouble = lambda method, path, number: 403
-    with pytest.raises(StorageError, match=f"{out}.* — check the credentials, and what they allow"):
-        run(toy_arm, toy_recording, out)
-    with pytest.raises(StorageError, match="check the credentials"):
-        ShardSet(out)
-
-
 def test_missing_credentials_are_one_error(proxy, monkeypatch, tmp_path) -> None:
     for name in KEYS:
         monkeypatch.delenv(name)
