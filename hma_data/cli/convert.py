@@ -199,6 +199,7 @@ def _print_plan(conversion: "Conversion", share: "Share | None", json: bool) -> 
     from hma_data.conversion.lerobot import dataset_plan
     from hma_data.conversion.plan import estimate, idle_workers
     from hma_data.shards.manifest import cameras_line
+    from hma_data.storage.remote import place
     from hma_data.tokenizers.base import get_tokenizer
 
     robot, workers = conversion.embodiment, conversion.workers
@@ -213,7 +214,12 @@ def _print_plan(conversion: "Conversion", share: "Share | None", json: bool) -> 
     if json:
         print_json(
             {
-                **_totals(plan, uri, conversion),
+                "source": uri,
+                "out": str(place(conversion.out)),
+                "episodes": plan.episodes,
+                "left_out": plan.left_out,
+                "frames_in_no_episode": plan.outside,
+                "frames": plan.frames,
                 "bytes": cost.bytes,
                 "frames_per_second": cost.frames_per_second,
                 "seconds": cost.seconds,
@@ -252,26 +258,18 @@ def _print_dataset_plan(conversion: "Conversion", json: bool) -> None:
     plan, uri = conversion.plan(AS_RECORDED)
     facts = plan.facts["dataset"]
     if json:
-        print_json({**_totals(plan, uri, conversion), **facts, "parts": len(plan.units)})
+        totals = {
+            "episodes": plan.episodes,
+            "left_out": plan.left_out,
+            "frames_in_no_episode": plan.outside,
+            "frames": plan.frames,
+        }
+        print_json({"source": uri, "out": str(conversion.out), **totals, **facts, "parts": len(plan.units)})
         return
     parts = human_count(len(plan.units), "part")
     say(f"{_read(plan, uri)} into a LeRobotDataset v3.0 of {facts['fps']} fps, made in {parts}")
     _print_sizes(facts["sizes"])
     _print_left_out(plan)
-
-
-def _totals(plan: "Plan", uri: str, conversion: "Conversion") -> dict[str, Any]:
-    """Return what --json states of any plan."""
-    from hma_data.storage.remote import place
-
-    return {
-        "source": uri,
-        "out": str(place(conversion.out)),
-        "episodes": plan.episodes,
-        "left_out": plan.left_out,
-        "frames_in_no_episode": plan.outside,
-        "frames": plan.frames,
-    }
 
 
 def _read(plan: "Plan", uri: str) -> str:

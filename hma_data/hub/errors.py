@@ -35,7 +35,7 @@ def explain(where: str, fault: BaseException) -> HubError:
         return HubError(where, f"the hub refuses the card: {shown(str(fault).partition('\n')[2])}", remedy)
     if isinstance(fault, errors.LocalEntryNotFoundError) and isinstance(cause, errors.HfHubHTTPError):
         return explain(where, cause)
-    away = _away()
+    away = errors.OfflineModeIsEnabled | httpx.ConnectError | httpx.TimeoutException
     plain: tuple[tuple[Any, str, str], ...] = (
         (errors.GatedRepoError, "is gated", f"ask for access on its page, then {LOG_IN}"),
         (errors.RevisionNotFoundError, "has no such revision", "name a branch, tag or commit of it"),
@@ -120,15 +120,11 @@ def is_missing(fault: HubError) -> bool:
 
 def is_away(fault: HubError) -> bool:
     """Check whether the hub is out of reach."""
-    return isinstance(fault.__cause__, _away())
-
-
-def _away() -> Any:
-    """Return the client's errors of a hub that is out of reach."""
     import httpx
     from huggingface_hub import errors
 
-    return errors.OfflineModeIsEnabled | httpx.ConnectError | httpx.TimeoutException
+    away = errors.OfflineModeIsEnabled | httpx.ConnectError | httpx.TimeoutException
+    return isinstance(fault.__cause__, away)
 
 
 def is_of_xet(fault: BaseException) -> bool:
