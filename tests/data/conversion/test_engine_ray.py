@@ -134,12 +134,6 @@ def test_a_step_that_ends_or_stops_its_actor_is_refused(kind: str, cluster, tmp_
 
 
 @on_a_cluster
-def test_an_error_that_is_not_the_datas_ends_the_run_as_it_is(cluster, tmp_path: Path) -> None:
-    with pytest.raises(TokenizerError, match="weights: are wrong"):
-        do([Unit("bad", ("a",), "a", "error"), *PLAIN], tmp_path)
-
-
-@on_a_cluster
 def test_a_node_that_is_lost_takes_no_unit_along(cluster, tmp_path: Path) -> None:
     extra = cluster.add_node(num_cpus=2)
     units = [Unit(f"long{i}", ("a",), "a", "nap", times=1) for i in range(6)]
@@ -306,15 +300,6 @@ def opened(make_work: Callable[[int], Work]) -> Worker:
     worker = Worker()
     assert worker.open(make_work, 1) == ("done", None)
     return worker
-
-
-def test_a_units_events_and_result_are_told_in_order(tmp_path: Path) -> None:
-    worker = opened(MakeWork(tmp_path))
-    for number, unit in enumerate(PLAIN[:2]):
-        end, events = worker.do(number, unit, FIRST_ATTEMPT)
-        assert end == ("done", (unit.name, ["a", "b"]))
-        said = [event for _, event in events if not isinstance(event, Step)]
-        assert said == [f"{unit.name} a", f"{unit.name} b"] and {n for n, _ in events} == {number}
 
 
 def test_an_actor_that_was_never_opened_says_so() -> None:

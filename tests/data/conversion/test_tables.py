@@ -220,14 +220,6 @@ def plan(episodes: list[EpisodeRef], arm: Embodiment, settings: Settings | None 
     return make_plan(episodes, arm, BlockTokenizer.spec, settings or Settings(), "toy")
 
 
-def test_splits_follow_the_episodes_id_not_its_place(toy_arm: Embodiment) -> None:
-    episodes = refs(*[10] * 200)
-    by_id = dict(zip((e.id for e in episodes), choose_splits(episodes, 0.2, 0), strict=True))
-    reverse = episodes[::-1]
-    assert dict(zip((e.id for e in reverse), choose_splits(reverse, 0.2, 0), strict=True)) == by_id
-    assert 20 <= sum(split == "val" for split in by_id.values()) <= 60
-
-
 @pytest.mark.parametrize(("episodes", "held_out"), [(1, 0), (2, 1), (8, 2), (20, 5), (28, 5), (60, 5)])
 def test_a_small_set_holds_out_five_episodes_or_a_quarter(episodes: int, held_out: int) -> None:
     known = [EpisodeRef(f"demo_{i}", 5) for i in range(episodes)]

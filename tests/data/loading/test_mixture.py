@@ -62,25 +62,11 @@ def test_draws_depend_on_seed_and_step_alone() -> None:
     assert (first != mixture.batch(13, 64)).any()
 
 
-def test_draws_follow_the_probabilities() -> None:
-    mixture = Mixture.of(dict(zip("abcd", COUNTS, strict=True)), 3)
-    drawn = np.concatenate([mixture.batch(step, 256) for step in range(200)])
-    np.testing.assert_allclose(np.bincount(drawn, minlength=4) / len(drawn), mixture.p, atol=0.01)
-
-
 def test_per_batch_draws_one_embodiment_a_batch() -> None:
     mixture = Mixture.of({"a": 10, "b": 10}, draw="per_batch")
     batches = [mixture.batch(step, 8) for step in range(40)]
     assert all(len(set(batch)) == 1 for batch in batches)
     assert len({int(batch[0]) for batch in batches}) == 2
-
-
-def test_realised_shares_stand_beside_the_intended() -> None:
-    rows = {row["embodiment"]: row for row in Mixture.of({"a": 30, "b": 10}).table([3, 1])}
-    assert rows["a"]["realised"] == 0.75
-    assert rows["a"]["intended"] == pytest.approx(3 ** (1 / 3) / (1 + 3 ** (1 / 3)))
-    assert rows["b"]["passes"] == 0.1
-    assert Mixture.of({"a": 30}).table([0])[0]["realised"] == 0
 
 
 def test_sets_of_a_group_share_one_weight() -> None:
@@ -168,10 +154,6 @@ def test_the_table_holds_counts_probabilities_and_passes(sets: list[str], tmp_pa
     assert small["epochs"] == pytest.approx(small["probability"] * 4_070 / 370)
     shown = mixture(*sets).output
     assert "bench_0" in shown and "p at τ = 3" in shown and "4,070 samples" in shown
-
-
-def test_proportional_sampling_passes_once_over_every_set(sets: list[str]) -> None:
-    assert [row["epochs"] for row in rows(*sets, "--temperature", "1")] == pytest.approx([1, 1])
 
 
 def test_weights_groups_caps_and_passes_reach_the_mixture(sets: list[str]) -> None:

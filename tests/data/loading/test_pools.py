@@ -127,12 +127,6 @@ def test_the_sequence_does_not_depend_on_how_it_is_taken(decoder: RowDecoder) ->
         assert rows_of(stream, start, 7) == whole[start : start + 7]
 
 
-def test_seeds_and_readers_have_orders_of_their_own(decoder: RowDecoder) -> None:
-    deal = UnitAssignment.of(decoder.index, 1)
-    one, other = (rows_of(WindowSequence(decoder, deal, seed, 0, 4), 0, 50) for seed in (1, 2))
-    assert one != other
-
-
 def test_a_pool_fits_its_memory(decoder: RowDecoder) -> None:
     assert pool_size(decoder, 0) == 1
     assert pool_size(decoder, 3.5 * decoder.group_bytes) == 3
