@@ -4,7 +4,8 @@ N scenes, S pixels a side, S' values of a state.
 """
 
 import sys
-from contextlib import redirect_stdout
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -41,24 +42,17 @@ class LeRobotPolicy:
         with imported("lerobot"):
             from lerobot.configs.policies import PreTrainedConfig
             from lerobot.policies.factory import get_policy_class, make_pre_post_processors
-        try:
-            with redirect_stdout(sys.stderr):  # it prints what it loads
-                config = PreTrainedConfig.from_pretrained(source)
-                config.device = device
-                config.pretrained_path = source
-                self._policy: Any = get_policy_class(config.type).from_pretrained(source, config=config)
-                there = {"device_processor": {"device": device}}
-                self._before, self._after = make_pre_post_processors(
-                    config,
-                    source,
-                    preprocessor_overrides=there,
-                    postprocessor_overrides={"device_processor": {"device": "cpu"}},
-                )
-        except Exception as fault:
-            said = f"cannot be loaded: {type(fault).__name__}: {fault}"
-            raise HMAError(
-                self.name, said, "give a folder or repository that lerobot itself loads"
-            ) from fault
+        with loading(self.name, "give a folder or repository that lerobot itself loads"):
+            config = PreTrainedConfig.from_pretrained(source)
+            config.device = device
+            config.pretrained_path = source
+            self._policy: Any = get_policy_class(config.type).from_pretrained(source, config=config)
+            self._before, self._after = make_pre_post_processors(
+                config,
+                source,
+                preprocessor_overrides={"device_processor": {"device": device}},
+                postprocessor_overrides={"device_processor": {"device": "cpu"}},
+            )
         self._policy.eval()
         self._check(config, scenes)
 
@@ -102,6 +96,19 @@ class LeRobotPolicy:
             )
             raise HMAError(self.name, fault, "give a policy that acts from images alone")
         return state
+
+
+@contextmanager
+def loading(where: str, remedy: str) -> Iterator[None]:
+    """Convert what lerobot raises while it loads something to an HMAError of one line."""
+    try:
+        with redirect_stdout(sys.stderr):  # it prints what it loads
+            yield
+    except HMAError:
+        raise
+    except Exception as fault:
+        said = f"cannot be loaded: {type(fault).__name__}: {str(fault).strip().partition(chr(10))[0]}"
+        raise HMAError(where, said, remedy) from fault
 
 
 def network_images(images: Images, size: tuple[int, ...]) -> Tensor:

@@ -10,9 +10,8 @@ N episodes, T frames, S pixels a side, V views side by side.
 """
 
 import json
-import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext, redirect_stdout
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,7 @@ from hma_data.shards.reader import ShardSet
 from hma_model.evaluation.agreement import NEEDED, Accuracy, accuracy, by_scene, independent, share_interval
 from hma_model.evaluation.state_reader import Tell
 from hma_model.generation.decode import cameras_for, trained_shards
-from hma_model.policies.lerobot import CONFIG, TASK, hub_repository, network_images
+from hma_model.policies.lerobot import CONFIG, TASK, hub_repository, loading, network_images
 from hma_model.worlds.env import Judge
 from hma_model.worlds.prompts import SeenShards, require_fit
 from hma_model.worlds.world import World
@@ -70,34 +69,28 @@ class RewardModel:
             from lerobot.rewards import get_reward_model_class
         from safetensors.torch import load_model
 
-        try:
-            with redirect_stdout(sys.stderr):  # it prints what it loads
-                kind = json.loads((folder / CONFIG).read_text()).get("type")
-                if kind in VIDEO_MODELS:
-                    remedy = "give a reward_classifier, or another model that scores single frames"
-                    raise HMAError(self.name, f"is a {kind}, which scores videos", remedy)
-                config = RewardModelConfig.from_pretrained(folder)
-                config.device = device
-                with _encoder_without_code() if kind == "reward_classifier" else nullcontext():
-                    self._model: Any = get_reward_model_class(config.type)(config)
-                # not by lerobot's loader, which leaves missing weights random
-                missing, _ = load_model(self._model, folder / WEIGHTS, strict=False)
-                if missing:
-                    raise ValueError(f"{WEIGHTS} lacks {min(missing)}")
-                self._model.to(device).eval()
-                self._before: Any = lambda batch: batch
-                for path in sorted(folder.glob(PREPROCESSOR)):
-                    _require_registered(path, self.name)
-                    there = {"device_processor": {"device": device}}
-                    self._before = PolicyProcessorPipeline.from_pretrained(
-                        folder, config_filename=path.name, overrides=there
-                    )
-        except HMAError:
-            raise
-        except Exception as fault:
-            said = f"cannot be loaded: {type(fault).__name__}: {str(fault).strip().partition(chr(10))[0]}"
-            remedy = "give a reward model that lerobot has saved, whose encoder needs no code of its own"
-            raise HMAError(self.name, said, remedy) from fault
+        remedy = "give a reward model that lerobot has saved, whose encoder needs no code of its own"
+        with loading(self.name, remedy):
+            kind = json.loads((folder / CONFIG).read_text()).get("type")
+            if kind in VIDEO_MODELS:
+                another = "give a reward_classifier, or another model that scores single frames"
+                raise HMAError(self.name, f"is a {kind}, which scores videos", another)
+            config = RewardModelConfig.from_pretrained(folder)
+            config.device = device
+            with _encoder_without_code() if kind == "reward_classifier" else nullcontext():
+                self._model: Any = get_reward_model_class(config.type)(config)
+            # not by lerobot's loader, which leaves missing weights random
+            missing, _ = load_model(self._model, folder / WEIGHTS, strict=False)
+            if missing:
+                raise ValueError(f"{WEIGHTS} lacks {min(missing)}")
+            self._model.to(device).eval()
+            self._before: Any = lambda batch: batch
+            for path in sorted(folder.glob(PREPROCESSOR)):
+                _require_registered(path, self.name)
+                there = {"device_processor": {"device": device}}
+                self._before = PolicyProcessorPipeline.from_pretrained(
+                    folder, config_filename=path.name, overrides=there
+                )
         self._keys = self._places(config, cameras)
 
     def _places(self, config: Any, cameras: Sequence[str]) -> dict[str, tuple[int, tuple[int, int]]]:
