@@ -120,8 +120,8 @@ def ends_of(ends: Floats, digits: int = 4) -> list[float] | None:
 
 def over_datasets(
     sets: Sequence[NDArray[Any]],
-    episodes: Sequence[Episodes] | None = None,
-    within: tuple[float, float] = ANY,
+    episodes: Sequence[NDArray[Any]],
+    within: tuple[float, float],
 ) -> tuple[float, list[float] | None]:
     """Return the mean over datasets of their means of values (N,), and its interval.
 
@@ -129,11 +129,10 @@ def over_datasets(
     are left out. There is no interval where a dataset has but one.
     """
     means, resampled = [], []
-    for number, values in enumerate(sets):
+    for number, (values, own) in enumerate(zip(sets, episodes, strict=True)):
         kept = np.isfinite(values)
-        own = None if episodes is None else np.asarray(episodes[number])[kept]
         means.append(values[kept].mean())
-        resampled.append(resampled_means(values[kept], number, own))
+        resampled.append(resampled_means(values[kept], number, own[kept]))
     low, high = np.percentile(np.mean(resampled, axis=0), LEVELS).clip(*within)
     ends = [float(low), float(high)] if np.isfinite(low) else None
     return float(np.mean(means)), ends

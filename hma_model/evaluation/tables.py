@@ -150,7 +150,7 @@ def means(parts: Sequence[Part]) -> list[dict[str, Any]]:
                 continue
             recordings = [part.by_window["recording"] for part in own]
             values = [part.by_window[figure.by_window] for part in own]
-            mean, ends = over_datasets(values, episodes=recordings, within=figure.within)
+            mean, ends = over_datasets(values, recordings, figure.within)
             scaled = perplexity if figure.exponential else float
             row[figure.path] = round(scaled(mean), 4)
             row[f"{figure.path}_95"] = ends and [round(scaled(end), 4) for end in ends]
