@@ -46,7 +46,7 @@ from hma_model.evaluation.metrics import (
     perplexity_summary,
     teacher_forced,
 )
-from hma_model.evaluation.perceptual import FeatureCollector, Networks
+from hma_model.evaluation.perceptual import NO_NETWORKS, FeatureCollector, Networks
 from hma_model.evaluation.rollouts import RolloutImages, rollout
 from hma_model.evaluation.scores import ROLLOUT_KINDS, Rolled, Scores, combined, figures_of, scores_of
 from hma_model.generation.decode import cameras_for, default_prompt
@@ -146,7 +146,7 @@ def measure(
     tokenizer: Tokenizer,
     data: StrPath | ShardSet,
     settings: EvaluationSettings = EvaluationSettings(),
-    networks: Networks | None = None,
+    networks: Networks = NO_NETWORKS,
     on_frames: Callable[[int], None] = lambda frames: None,
 ) -> Measured:
     """Compute a model's figures on one shard set; rollouts are compared with the decoded true tokens.
@@ -191,7 +191,7 @@ def measure(
         on_frames(predicted)
         return made
 
-    rolled = Rolled(first, FeatureCollector(networks or Networks()))
+    rolled = Rolled(first, FeatureCollector(networks))
     for number, batch in enumerate(batches):
         rolled.add(batch, partial(roll, prompt=first, seed=seed + number), draws, seed)
     joined = {kind: combined(parts) for kind, parts in rolled.scores.items()}

@@ -63,6 +63,9 @@ class Networks:
         return torch.cat(found).double().numpy().reshape(truth.shape[:-3])
 
 
+NO_NETWORKS = Networks()
+
+
 def open_networks(
     lpips: StrPath | None = None, fid: StrPath | None = None, fvd: StrPath | None = None
 ) -> Networks:

@@ -149,7 +149,6 @@ def measure_recorded_state(
     if (episodes := shards.manifest.splits["train"]["episodes"]) < EPISODES_NEEDED:
         few = f"{episodes} training episodes are too few to read their states, {EPISODES_NEEDED} are needed"
         return missing(few)
-    states = _States(shards)
     hashable: Any = tokenizer
     reader = _kept_reader(hashable, shards, cameras if isinstance(cameras, str) else tuple(cameras), seed)
     if reader is None:
@@ -157,7 +156,7 @@ def measure_recorded_state(
     errors: dict[str, list[Floats]] = {}
     for number, batch in enumerate(batches):
         truth = decode(tokenizer, batch.stored)
-        true = states.of(batch, truth.shape[1])[:, prompt:]
+        true = _states(shards, batch, truth.shape[1])[:, prompt:]
         films = {"copy": truth[:, prompt - 1 : prompt].repeat(true.shape[1], axis=1)}
         films["reconstruction"] = truth[:, prompt:]
         for kind, made in predicted.items():
@@ -207,7 +206,7 @@ def recorded_reader(
     """
     dataset = WindowDataset(shards, "train", 1, cameras=cameras)
     seen = dataset.batch(evenly(len(dataset), IMAGE_LIMIT))
-    wanted = _States(shards).of(seen, 1)[:, 0]
+    wanted = _states(shards, seen, 1)[:, 0]
     known = np.isfinite(wanted).all(axis=1)
     recordings = shards.recordings(episodes_of([seen]))[known]
     if len(np.unique(recordings)) < 2:
@@ -259,23 +258,19 @@ def _digits(value: float) -> float | None:
     return float(f"{value:.4g}") if np.isfinite(value) else None
 
 
-class _States:
-    def __init__(self, shards: ShardSet) -> None:
-        self._shards = shards
-        known = [name for name in mask_columns(shards.embodiment) if name == "state_known"]
-        columns = ["frame_index", "state", *known]
-        self._rows = lru_cache(256)(lambda episode: shards.episode_rows(episode, columns))
-
-    def of(self, batch: Batch, frames: int) -> Floats:
-        """Return (N, T, S) of the windows' frames, NaN where unknown."""
-        assert batch.episode is not None and batch.frame is not None
-        found = []
-        for episode, frame in zip(batch.episode.tolist(), batch.frame.tolist(), strict=True):
-            rows = self._rows(episode)
-            first = int(np.flatnonzero(rows["frame_index"] == frame)[0])
-            chosen = first + np.arange(frames) * self._shards.row_stride
-            states = rows["state"][chosen].astype(np.float64)
-            if "state_known" in rows:
-                states[~rows["state_known"][chosen]] = np.nan
-            found.append(states)
-        return np.stack(found)
+def _states(shards: ShardSet, batch: Batch, frames: int) -> Floats:
+    """Return the recorded states (N, T, S) of the windows' frames, NaN where unknown."""
+    assert batch.episode is not None and batch.frame is not None
+    known = [name for name in mask_columns(shards.embodiment) if name == "state_known"]
+    # windows come episode by episode
+    read = lru_cache(1)(lambda episode: shards.episode_rows(episode, ["frame_index", "state", *known]))
+    found = []
+    for episode, frame in zip(batch.episode.tolist(), batch.frame.tolist(), strict=True):
+        rows = read(episode)
+        first = int(np.flatnonzero(rows["frame_index"] == frame)[0])
+        chosen = first + np.arange(frames) * shards.row_stride
+        states = rows["state"][chosen].astype(np.float64)
+        if "state_known" in rows:
+            states[~rows["state_known"][chosen]] = np.nan
+        found.append(states)
+    return np.stack(found)

@@ -17,7 +17,7 @@ from hma_data.loading.dataset import Batch
 from hma_model.evaluation.actions import shuffled, without_actions
 from hma_model.evaluation.intervals import NATURAL, Episodes, horizon_summary
 from hma_model.evaluation.metrics import PSNR_LIMIT, PSNR_RANGE, SSIM_RANGE, psnr, ssim
-from hma_model.evaluation.perceptual import FeatureCollector, Networks
+from hma_model.evaluation.perceptual import NO_NETWORKS, FeatureCollector, Networks
 from hma_model.evaluation.rollouts import RolloutImages
 
 ROLLOUT_KINDS = ("true", "shuffled", "none", "copy")
@@ -26,12 +26,12 @@ RANGES = {"psnr": PSNR_RANGE, "ssim": SSIM_RANGE, "lpips": NATURAL}
 Scores = dict[str, Floats]  # by the names of RANGES, (B, P); NaN where a frame is not finite
 
 
-def scores_of(pictures: RolloutImages, networks: Networks | None = None) -> Scores:
+def scores_of(pictures: RolloutImages, networks: Networks = NO_NETWORKS) -> Scores:
     """Return the scores of rollouts; LPIPS if there is a network for it."""
     truth = pictures.truth[:, pictures.prompt :]
     predicted = pictures.predicted[:, pictures.prompt :]
     found = {"psnr": psnr(truth, predicted, limit=PSNR_LIMIT), "ssim": ssim(truth, predicted)}
-    if networks and networks.lpips:
+    if networks.lpips:
         found["lpips"] = networks.lpips_of(truth, predicted)
     return {name: np.where(pictures.finite, values, np.nan) for name, values in found.items()}
 

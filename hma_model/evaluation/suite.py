@@ -35,7 +35,7 @@ from hma_data.storage.paths import StrPath, as_path, as_text
 from hma_data.tokenizers.base import Tokenizer
 from hma_model.checkpoint.io import record_locally
 from hma_model.evaluation.evaluate import EvaluationSettings, WindowPlan, measure
-from hma_model.evaluation.perceptual import Networks
+from hma_model.evaluation.perceptual import NO_NETWORKS, Networks
 from hma_model.evaluation.recorded_state import measure_recorded_state
 from hma_model.evaluation.simulated import measure_state
 from hma_model.evaluation.verdict import follows, verdict
@@ -76,8 +76,8 @@ class Part:
 def evaluate_all(
     checkpoints: Sequence[StrPath],
     data: Sequence[StrPath],
-    settings: EvaluationSettings | None = None,
-    networks: Networks | None = None,
+    settings: EvaluationSettings,
+    networks: Networks = NO_NETWORKS,
     out: StrPath | None = None,
     device: str = "cpu",
 ) -> list[Part]:
@@ -96,7 +96,6 @@ def evaluate_all(
         UsageError: a split has no window, cameras do not fit, or a set of a checkpoint comes twice.
         OutputError: the folder holds something else.
     """
-    settings, networks = settings or EvaluationSettings(), networks or Networks()
     kept = None if out is None else KeptParts(_folder(as_path(out)), {})
     sets = [ShardSet(item) for item in data]
     _once([as_text(item) for item in checkpoints], "checkpoint")

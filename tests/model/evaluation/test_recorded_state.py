@@ -168,7 +168,7 @@ def test_a_prediction_that_is_not_finite_has_no_error(disc, monkeypatch) -> None
 def test_a_set_whose_states_are_all_unknown_in_part_has_no_reader(disc, monkeypatch) -> None:
     unknown = np.array([0.0, np.nan, 0.0, 0.0])
     monkeypatch.setattr(
-        recorded_state._States, "of", lambda _, batch, frames: np.full((len(batch), frames, 4), unknown)
+        recorded_state, "_states", lambda _, batch, frames: np.full((len(batch), frames, 4), unknown)
     )
     assert recorded_state.recorded_reader(BlockTokenizer(), disc, "first", 0) is None
     batches = list(windows(disc, "val", 8, 4))
