@@ -16,7 +16,6 @@ from hma_model.evaluation.agreement import (
     episode_correlation,
     mmrv,
     precision_recall,
-    rank_violation,
     share_interval,
 )
 
@@ -49,16 +48,14 @@ def test_policies_that_one_episode_parts_have_no_certain_correlation() -> None:
 
 @pytest.mark.parametrize(
     ("shape", "said"),
-    [
-        ((2, 20), "2 of at least 3 policies"),
-        ((4, 5), "5 of at least 8 episodes"),
-        ((4, 9), "equal in"),
-    ],
+    [((2, 20), "2 of at least 3 policies"), ((4, 5), "5 of at least 8 episodes"), ((4, 9), "equal in")],
 )
 def test_too_little_is_said_and_not_computed(shape: tuple[int, int], said: str) -> None:
-    one = np.random.default_rng(4).random(shape)
-    for found in correlations(one, np.zeros(shape)).values():
+    one, still = np.random.default_rng(4).random(shape), np.zeros(shape)
+    for found in (*correlations(one, still).values(), mmrv(still, one)):
         assert found.value is None and said in found.reason and said in str(found)
+    few = auroc(still > 0, one).reason
+    assert few == ("all episodes have the same outcome" if shape[1] > 8 else said)
 
 
 def test_three_or_four_policies_have_a_correlation_without_an_interval() -> None:
@@ -189,10 +186,9 @@ def test_intervals_of_shares_and_scores_resample_the_scenes_with_all_their_polic
     assert one.balanced == other.balanced and other.high - other.low > 1.5 * (one.high - one.low)
 
 
-@pytest.mark.parametrize("scenes", [16, 32])
-def test_policies_that_all_do_the_same_tell_no_more_than_one(scenes: int) -> None:
-    rng = np.random.default_rng(scenes)
-    true, judged = of_scenes(rng, 1, scenes, 0.4), of_scenes(rng, 1, scenes, 0.5)
+def test_policies_that_all_do_the_same_tell_no_more_than_one() -> None:
+    rng = np.random.default_rng(16)
+    true, judged = of_scenes(rng, 1, 16, 0.4), of_scenes(rng, 1, 16, 0.5)
     alone, same = accuracy(true, judged), accuracy(true.repeat(8, axis=0), judged.repeat(8, axis=0))
     assert (same.low, same.high) == pytest.approx((alone.low, alone.high))
     assert (alone.low, alone.high) == pytest.approx((accuracy(true[0], judged[0]).low, alone.high))
@@ -234,17 +230,6 @@ def test_equal_policies_are_seldom_told_apart_among_many_pairs() -> None:
     assert np.mean(told) < 0.1  # 0.4 without the correction
 
 
-def correlation_by_hand(one: list[float], other: list[float]) -> float:
-    middle, centre = sum(one) / len(one), sum(other) / len(other)
-    shared = sum((a - middle) * (b - centre) for a, b in zip(one, other, strict=True))
-    squares = sum((a - middle) ** 2 for a in one) * sum((b - centre) ** 2 for b in other)
-    return shared / squares**0.5
-
-
-def ranks_by_hand(values: list[float]) -> list[float]:
-    return [sum(b < a for b in values) + (sum(b == a for b in values) + 1) / 2 for a in values]
-
-
 def violation_by_hand(true: list[float], made: list[float]) -> float:
     """Return SIMPLER's MMRV: for each policy, the worst pair; then the mean over policies."""
     worst = []
@@ -272,15 +257,11 @@ BOTH = st.tuples(st.integers(3, 6), st.integers(8, 12)).flatmap(
 @given(BOTH)
 def test_every_measure_is_what_plain_loops_compute(both: tuple[np.ndarray, np.ndarray]) -> None:
     one, other = both
-    means = [row.mean() for row in one], [row.mean() for row in other]
-    found = correlations(one, other)
-    if found["pearson"].value is not None:
-        assert found["pearson"].value == pytest.approx(correlation_by_hand(*means), abs=1e-9)
-        ranks = [ranks_by_hand(values) for values in means]
-        assert found["spearman"].value == pytest.approx(correlation_by_hand(*ranks), abs=1e-9)
     violation = mmrv(one, other)
     if violation.value is not None:
-        assert violation.value == pytest.approx(violation_by_hand(*means))
+        assert violation.value == pytest.approx(
+            violation_by_hand(*(values.mean(axis=1).tolist() for values in both))
+        )
         assert violation.low <= violation.value <= violation.high
     true = one > 0
     area = auroc(true, other)
@@ -289,12 +270,6 @@ def test_every_measure_is_what_plain_loops_compute(both: tuple[np.ndarray, np.nd
     else:
         assert area.value == pytest.approx(area_by_hand(true.ravel().tolist(), other.ravel().tolist()))
         assert 0 <= area.low <= area.high <= 1
-    precision, recall = precision_recall(true, other > 0)
-    hits = sum(a and b > 0 for a, b in zip(true.ravel().tolist(), other.ravel().tolist(), strict=True))
-    if precision.value is not None:
-        assert precision.value == hits / sum(b > 0 for b in other.ravel().tolist())
-    if recall.value is not None:
-        assert recall.value == hits / sum(true.ravel().tolist())
 
 
 def test_intervals_of_mmrv_and_auroc_resample_the_episodes_of_all_policies_together() -> None:
@@ -327,12 +302,3 @@ def test_intervals_over_policies_hold_what_more_episodes_would_show(scenes: int,
             held[name] += one.low - 1e-9 <= (0 if name == "mmrv" else 1) <= one.high + 1e-9
     told = held.values() if model > 0.5 else [held["mmrv"]]  # else all resamples violate some order
     assert min(told) >= 0.85 * draws, held
-
-
-def test_a_model_that_turns_the_order_round_violates_it_by_the_largest_differences() -> None:
-    assert rank_violation([0.0, 0.5, 1.0], [1.0, 0.5, 0.0]) == pytest.approx((1 + 0.5 + 1) / 3)
-    assert rank_violation([0.0, 0.5, 1.0], [0.2, 0.3, 0.9]) == 0
-    assert "2 of at least 3" in mmrv(np.ones((2, 9)), np.ones((2, 9))).reason
-    assert "5 of at least 8" in auroc(np.ones((3, 5), bool), np.ones((3, 5))).reason
-    assert "equal in the simulator" in mmrv(np.ones((3, 9)), np.ones((3, 9))).reason
-    assert "the same outcome" in auroc(np.ones((3, 9), bool), np.ones((3, 9))).reason

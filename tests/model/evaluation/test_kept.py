@@ -103,7 +103,12 @@ def test_a_reader_comes_back_with_its_weights_and_values(folder: Path) -> None:
 
 @pytest.mark.slow
 def test_a_kept_probe_reads_as_the_trained_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in {"EPISODES": 3, "HELD_OUT_SHARE": 0.34, "EPISODE_FRAMES": 8}.items():
+    for name, value in {
+        "EPISODES": 3,
+        "HELD_OUT_SHARE": 0.34,
+        "EPISODE_FRAMES": 8,
+        "TRAINING_STEPS": 5,
+    }.items():
         monkeypatch.setattr(probe, name, value)
     embedded, told = get_tokenizer("fsq-lab"), list[str]()
     first = train_probe("pusht_fast", embedded, 2, tell=told.append)

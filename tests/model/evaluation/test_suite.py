@@ -248,7 +248,7 @@ def test_recorded_pictures_are_those_of_the_windows_frames(tmp_path: Path) -> No
     from hma_data.shards.reader import ShardSet
     from hma_model.generation.decode import decode
 
-    recording = record("pendulum", tmp_path / "rec", 4, seed=1)
+    recording = record("pendulum", tmp_path / "rec", 2, seed=1)
     convert(find("pendulum"), recording, "fsq-8", tmp_path / "shards")
     shards = ShardSet(tmp_path / "shards")
     batch = WindowDataset(shards, "train", 4).batch([7])
