@@ -23,8 +23,9 @@ from rosbags.typesys import Stores, get_typestore
 from hma_data.episodes.episode import Episode
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import open_source
+from tests.data import ros2
+from tests.data.ros2 import START_NS
 
-START_NS = 1_700_000_000_000_000_000
 LATE_NS = 5_000_000
 JOINTS = ("shoulder", "elbow", "wrist")
 CAMERA, STATE, COMMAND = "/cam/image.raw", "/joint_states", "/command"
@@ -89,11 +90,7 @@ def ros_message(store: Any, item: Item) -> Any:
     if item.topic == COMMAND:
         layout = types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
         return types[ROS_TYPES[COMMAND]](layout=layout, data=item.value)
-    seconds, nanoseconds = divmod(item.stamp_ns, 10**9)
-    stamp = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
-    header_type = types["std_msgs/msg/Header"]
-    more = {"seq": 0} if "seq" in header_type.__dataclass_fields__ else {}
-    header = header_type(stamp=stamp, frame_id="robot", **more)
+    header = ros2.header(item.stamp_ns, store)
     if item.topic == STATE:
         none = np.zeros(0)
         return types[ROS_TYPES[STATE]](header, list(JOINTS), item.value, velocity=none, effort=none)
@@ -101,33 +98,25 @@ def ros_message(store: Any, item: Item) -> Any:
     return types[ROS_TYPES[CAMERA]](header, height, width, "rgb8", 0, width * 3, item.value.reshape(-1))
 
 
-def write_by_rosbags(
-    writer: Ros1Writer | Ros2Writer, recording: Recording, store: Any, serialize: Callable[..., Any]
-) -> None:
-    with writer:
-        connections = {
-            topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in ROS_TYPES.items()
-        }
-        for item in items(recording):
-            data = serialize(ros_message(store, item), ROS_TYPES[item.topic])
-            writer.write(connections[item.topic], item.log_ns, data)
+def send(writer: Ros1Writer | Ros2Writer, recording: Recording, store: Any) -> None:
+    sent = ((item.topic, ros_message(store, item), item.log_ns) for item in items(recording))
+    ros2.send(writer, sent, store)
 
 
 def write_ros1(path: Path, recording: Recording, compression: str | None = None) -> Path:
-    store, writer = get_typestore(Stores.ROS1_NOETIC), Ros1Writer(path)
+    writer = Ros1Writer(path)
     if compression:
         writer.set_compression(Ros1Writer.CompressionFormat[compression])
-    write_by_rosbags(writer, recording, store, store.serialize_ros1)
+    send(writer, recording, get_typestore(Stores.ROS1_NOETIC))
     return path
 
 
 def write_ros2(
     path: Path, recording: Recording, plugin: str, mode: CompressionMode = CompressionMode.NONE
 ) -> Path:
-    store = get_typestore(Stores.ROS2_HUMBLE)
     writer = Ros2Writer(path, version=9, storage_plugin=StoragePlugin[plugin])
     writer.set_compression(mode, CompressionFormat.ZSTD)
-    write_by_rosbags(writer, recording, store, store.serialize_cdr)
+    send(writer, recording, ros2.TYPES)
     return path
 
 

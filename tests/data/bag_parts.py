@@ -17,6 +17,7 @@ from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 
 from hma_data.registry.embodiment import Embodiment
+from tests.data import ros2
 from tests.data.bag_files import START_NS, arm
 from tests.hostile import without_index
 
@@ -75,35 +76,26 @@ def _ns(at_s: float) -> int:
 
 
 def _message(store: Any, run: Run, item: Said) -> Any:
-    types = store.types
+    kind = store.types[TYPES[item.topic]]
     if item.topic != CAMERA:
-        return types[TYPES[item.topic]](item.value)
+        return kind(item.value)
     stamps = run.times if run.stamps is None else run.stamps
-    seconds, nanoseconds = divmod(_ns(float(stamps[item.value])), 10**9)
-    header_type = types["std_msgs/msg/Header"]
-    more = {"seq": 0} if "seq" in header_type.__dataclass_fields__ else {}
-    stamp = types["builtin_interfaces/msg/Time"](seconds, nanoseconds)
-    header = header_type(stamp=stamp, frame_id="c", **more)
+    header = ros2.header(_ns(float(stamps[item.value])), store)
     side = run.pictures.shape[1]
-    data = run.pictures[item.value].reshape(-1)
-    return types[TYPES[CAMERA]](header, side, side, "rgb8", 0, side * 3, data)
+    return kind(header, side, side, "rgb8", 0, side * 3, run.pictures[item.value].reshape(-1))
 
 
-def _used(run: Run) -> list[str]:
-    return [topic for topic in TYPES if any(item.topic == topic for item in run.messages())]
+def _send(writer: Ros1Writer | Ros2Writer, run: Run, store: Any) -> None:
+    sent = ((item.topic, _message(store, run, item), _ns(item.at_s)) for item in run.messages())
+    ros2.send(writer, sent, store)
 
 
 def ros1(folder: Path, run: Run, compression: str | None = None, chunk: int = 4096) -> Path:
-    store = get_typestore(Stores.ROS1_NOETIC)
     writer = Ros1Writer(folder / "run.bag")
     writer.chunk_threshold = chunk
     if compression:
         writer.set_compression(Ros1Writer.CompressionFormat[compression])
-    with writer:
-        made = {t: writer.add_connection(t, TYPES[t], typestore=store) for t in _used(run)}
-        for item in run.messages():
-            data = store.serialize_ros1(_message(store, run, item), TYPES[item.topic])
-            writer.write(made[item.topic], _ns(item.at_s), data)
+    _send(writer, run, get_typestore(Stores.ROS1_NOETIC))
     return folder / "run.bag"
 
 
@@ -114,19 +106,13 @@ def ros1_without_index(folder: Path, run: Run) -> Path:
 
 
 def sqlite(folder: Path, run: Run) -> Path:
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    with Ros2Writer(folder / "run", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
-        made = {t: writer.add_connection(t, TYPES[t], typestore=store) for t in _used(run)}
-        for item in run.messages():
-            data = store.serialize_cdr(_message(store, run, item), TYPES[item.topic])
-            writer.write(made[item.topic], _ns(item.at_s), data)
+    _send(Ros2Writer(folder / "run", version=9, storage_plugin=StoragePlugin.SQLITE3), run, ros2.TYPES)
     return folder / "run"
 
 
 def mcap(folder: Path, run: Run, more: list[tuple[str, str, str, float, bytes]] = [], **options: Any) -> Path:  # noqa: B006
     """An MCAP file; `more` are messages already encoded: topic, type, definition, seconds, bytes."""
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    items = []
+    store, items = ros2.TYPES, []
     for item in run.messages():
         kind = TYPES[item.topic]
         data = bytes(store.serialize_cdr(_message(store, run, item), kind))

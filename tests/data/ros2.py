@@ -1,12 +1,15 @@
-"""ROS 2 bags of a camera whose frames carry their number as a level of grey, and of any other messages."""
+"""Messages of ROS, and bags of them; frames of a camera carry their number as a level of grey."""
 
 import shutil
 from collections.abc import Iterable, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import av
 import cv2
 import numpy as np
+from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -26,22 +29,30 @@ def define(name: str, text: str) -> Any:
 def write(path: Path, messages: Iterable[Sent], mcap: bool = False) -> Path:
     shutil.rmtree(path, ignore_errors=True)
     plugin = StoragePlugin.MCAP if mcap else StoragePlugin.SQLITE3
-    with Writer(path, version=9, storage_plugin=plugin) as writer:
-        connections: dict[str, Any] = {}
-        for topic, message, received in messages:
-            kind = message.__msgtype__
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=TYPES)
-            writer.write(connections[topic], received, TYPES.serialize_cdr(message, kind))
+    send(Writer(path, version=9, storage_plugin=plugin), messages)
     return path
 
 
-def stamp(ns: int) -> Any:
-    return TYPES.types["builtin_interfaces/msg/Time"](sec=ns // 10**9, nanosec=ns % 10**9)
+def send(writer: Ros1Writer | Writer, messages: Iterable[Sent], store: Any = TYPES) -> None:
+    """Write messages, of that store's types, with a writer of rosbags."""
+    serialize = store.serialize_ros1 if isinstance(writer, Ros1Writer) else store.serialize_cdr
+    connections: dict[str, Any] = {}
+    with writer:
+        for topic, message, received in messages:
+            kind = message.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=store)
+            writer.write(connections[topic], received, serialize(message, kind))
 
 
-def header(ns: int) -> Any:
-    return TYPES.types["std_msgs/msg/Header"](stamp=stamp(ns), frame_id="x")
+def stamp(ns: int, store: Any = TYPES) -> Any:
+    return store.types["builtin_interfaces/msg/Time"](sec=ns // 10**9, nanosec=ns % 10**9)
+
+
+def header(ns: int, store: Any = TYPES) -> Any:
+    kind = store.types["std_msgs/msg/Header"]
+    more = {"seq": 0} if "seq" in kind.__dataclass_fields__ else {}
+    return kind(stamp=stamp(ns, store), frame_id="x", **more)
 
 
 def pixels(number: int, side: int = 32) -> np.ndarray:
@@ -76,3 +87,21 @@ def array(values: Sequence[float]) -> Any:
 def numbers(clip: Clip, camera: str = "cam") -> list[int]:
     frames = clip.episode.streams[camera].frames(clip.frame_indices[camera])
     return [round((float(np.median(frame)) - 40) / LEVELS) for frame in frames]
+
+
+def packets(
+    pictures: Iterable[np.ndarray], encoder: str, options: dict[str, str], gop: int, pixels: str = "yuv420p"
+) -> list[tuple[int, bytes]]:
+    """Return what an encoder makes of pictures of one size: the number of the picture, and its bytes."""
+    context = None
+    found = []
+    for i, picture in enumerate(pictures):
+        if context is None:
+            context = av.CodecContext.create(encoder, "w")
+            context.height, context.width = picture.shape[:2]
+            context.pix_fmt, context.gop_size, context.options = pixels, gop, options
+            context.time_base, context.framerate = Fraction(1, 10), Fraction(10, 1)
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
+        frame.pts = i
+        found += context.encode(frame.reformat(format=pixels))
+    return [(packet.pts, bytes(packet)) for packet in found + context.encode(None)]

@@ -111,9 +111,9 @@ class Toy(tfds.core.GeneratorBasedBuilder):
             )
 
 
-def build(folder: Path, shards: int = 3, file_format: str = "tfrecord") -> Path:
-    config = tfds.download.DownloadConfig(num_shards=shards)
-    builder = Toy(data_dir=folder, file_format=file_format)
+def build(folder: Path) -> Path:
+    config = tfds.download.DownloadConfig(num_shards=3)
+    builder = Toy(data_dir=folder, file_format="tfrecord")
     builder.download_and_prepare(download_config=config)
     return Path(builder.data_dir)
 

@@ -1,11 +1,8 @@
 """What messages of images hold goes before what they are called: video, lost frames, mosaics."""
 
-import tempfile
-from fractions import Fraction
 from functools import cache
 from pathlib import Path
 
-import av
 import cv2
 import numpy as np
 import pytest
@@ -41,19 +38,8 @@ STREAMS = {
 
 def packets(name: str) -> list[tuple[int, bytes]]:
     encoder, options = STREAMS[name]
-    context = av.CodecContext.create(encoder, "w")
-    context.width = context.height = 96
-    context.pix_fmt, context.gop_size = "yuv420p", 8
-    context.time_base, context.framerate = Fraction(1, 10), Fraction(10, 1)
-    context.options = options | {"crf": "4"}
-    found = []
-    for i in [*range(FRAMES), None]:
-        frame = None
-        if i is not None:
-            frame = av.VideoFrame.from_ndarray(ros2.pixels(i, 96), format="rgb24")
-            frame.pts = i
-        found += [(packet.pts, bytes(packet)) for packet in context.encode(frame)]
-    return found
+    pictures = (ros2.pixels(i, 96) for i in range(FRAMES))
+    return ros2.packets(pictures, encoder, options | {"crf": "4"}, gop=8)
 
 
 def bag(path: Path, name: str, message, stamped_as_shown: bool = False) -> Path:
@@ -219,26 +205,11 @@ REORDERED = {
 
 @cache
 def messages(name: str) -> list[bytes]:
-    codec, encoder, options = {**CODECS, **REORDERED}[name]
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / {"h264": "v.h264", "h265": "v.hevc"}.get(codec, "v.mkv")
-        film(path, encoder, options)
-        with av.open(str(path)) as container:
-            return [bytes(packet) for packet in container.demux(video=0) if packet.size]
-
-
-def film(path: Path, encoder: str, options: dict[str, str]) -> None:
-    draw = np.random.default_rng(0)
-    ground = draw.integers(0, 255, (12, 16, 3), np.uint8).repeat(8, 0).repeat(8, 1)
-    with av.open(str(path), "w") as out:
-        stream = out.add_stream(encoder, rate=10, options=options)
-        stream.width, stream.height = 128, 96
-        stream.pix_fmt = "yuv444p" if options.get("profile") == "high444" else "yuv420p"
-        stream.codec_context.gop_size = GROUP
-        for i in range(LONG):
-            picture = np.ascontiguousarray(np.roll(ground, (3 * i, 5 * i), (0, 1)))
-            out.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
-        out.mux(stream.encode(None))
+    _, encoder, options = {**CODECS, **REORDERED}[name]
+    ground = np.random.default_rng(0).integers(0, 255, (12, 16, 3), np.uint8).repeat(8, 0).repeat(8, 1)
+    pictures = (np.roll(ground, (3 * i, 5 * i), (0, 1)) for i in range(LONG))
+    pixels = "yuv444p" if options.get("profile") == "high444" else "yuv420p"
+    return [data for _, data in ros2.packets(pictures, encoder, options, GROUP, pixels)]
 
 
 def decoded(packets: list[bytes], codec: str, in_order: bool) -> list[Images | None]:

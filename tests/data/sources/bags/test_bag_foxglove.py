@@ -1,5 +1,6 @@
 """Foxglove's messages in every encoding, and bags against the formats' own readers."""
 
+import base64
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import yaml
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import Writer
 from rosbags.rosbag1 import Reader as Ros1Reader
@@ -17,11 +19,11 @@ from hma_data.episodes.align import to_clip
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.inspection.inspect import examine, inspect_recording
 from hma_data.sources.bags.bag import Bag
-from hma_data.sources.bags.container import Channel, RecordFilter
+from hma_data.sources.bags.container import Channel
 from hma_data.sources.bags.messages import decode, numbers
 from hma_data.tokenizers import get_tokenizer
 from hma_data.tokenizers.training.frames import recording_films
-from tests.data import bag_parts
+from tests.data import bag_parts, ros2
 from tests.data.bag_files import (
     BLOB,
     CAMERA,
@@ -37,7 +39,7 @@ from tests.data.bag_files import (
     ros_message,
     write_mcap,
 )
-from tests.data.sources.bags.test_bag_pictures import LOW_DELAY, VIDEO_YAML
+from tests.data.sources.bags.test_bag_pictures import LOW_DELAY, VIDEO_YAML, gradients
 
 PICTURES = np.random.default_rng(3).integers(0, 256, (6, 10, 14, 3), np.uint8)
 FIELDS = {
@@ -51,20 +53,6 @@ def png(picture: np.ndarray) -> np.ndarray:
     return cv2.imencode(".png", picture[..., ::-1])[1].reshape(-1)
 
 
-def packets(pictures: np.ndarray) -> list[bytes]:
-    import av
-
-    encoder = av.CodecContext.create("libx264", "w")
-    encoder.width, encoder.height, encoder.pix_fmt = pictures.shape[2], pictures.shape[1], "yuv420p"
-    encoder.options = LOW_DELAY
-    found = []
-    for i, picture in enumerate(pictures):
-        frame = av.VideoFrame.from_ndarray(picture, format="rgb24").reformat(format="yuv420p")
-        frame.pts = i
-        found += encoder.encode(frame)
-    return [bytes(packet) for packet in found + encoder.encode(None)]
-
-
 def values(name: str, pictures: np.ndarray) -> list[dict[str, Any]]:
     if name == "RawImage":
         height, width = pictures.shape[1:3]
@@ -72,7 +60,10 @@ def values(name: str, pictures: np.ndarray) -> list[dict[str, Any]]:
         return [about | {"data": picture.reshape(-1)} for picture in pictures]
     if name == "CompressedImage":
         return [{"data": png(picture), "format": "png"} for picture in pictures]
-    return [{"data": np.frombuffer(data, np.uint8), "format": "h264"} for data in packets(pictures)]
+    return [
+        {"data": np.frombuffer(data, np.uint8), "format": "h264"}
+        for _, data in ros2.packets(pictures, "libx264", LOW_DELAY, gop=10)
+    ]
 
 
 def ros_encoder(name: str, encoding: str) -> tuple[str, str, bytes, Callable[[int, dict[str, Any]], bytes]]:
@@ -137,9 +128,8 @@ def test_foxglove_pictures_in_every_encoding(tmp_path: Path, name: str, encoding
 
 @pytest.mark.parametrize("encoding", ["cdr", "ros1", "protobuf"])
 def test_foxglove_video_in_every_encoding(tmp_path: Path, encoding: str) -> None:
-    y, x = np.mgrid[:64, :96]
-    pictures = np.stack([np.stack([x * 2, y * 3, np.full_like(x, 8 * i)], -1) for i in range(24)])
-    path = write(tmp_path / "run.mcap", "CompressedVideo", encoding, pictures.astype(np.uint8))
+    pictures = gradients(24)
+    path = write(tmp_path / "run.mcap", "CompressedVideo", encoding, pictures)
     stream = read(path, arm(VIDEO_YAML)).streams["cam"]
     for indices in ([0, 5], [23], [11, 4]):
         assert np.abs(stream.frames(indices).astype(int) - pictures[indices]).mean() < 4, indices
@@ -152,7 +142,10 @@ def test_big_endian_messages_are_read(tmp_path: Path) -> None:
     for topic, encoded in how.items():
 
         def encode(item: Any, kind: str = encoded.type) -> bytes:
-            return bytes(store.serialize_cdr(ros_message(store, item), kind, little_endian=False))
+            message = ros_message(store, item)
+            if item.topic == CAMERA:
+                message.is_bigendian = 1  # it says so of pixels of several bytes, which rgb8 has not
+            return bytes(store.serialize_cdr(message, kind, little_endian=False))
 
         how[topic] = encoded._replace(encode=encode)
     episode = read(write_mcap(tmp_path / "run.mcap", recording, how), arm())
@@ -160,21 +153,6 @@ def test_big_endian_messages_are_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(stream.frames(range(4)), recording.pictures)
     np.testing.assert_allclose(stream.timestamps, recording.picture_ns / 1e9, rtol=0, atol=1e-6)
     np.testing.assert_array_equal(episode.actions[0].values, recording.commands.astype(np.float32))
-
-
-def test_an_image_that_says_it_is_big_endian_has_the_same_bytes(tmp_path: Path) -> None:
-    recording, store = make_recording(3), get_typestore(Stores.ROS2_HUMBLE)
-    how = as_cdr()
-
-    def encode(item: Any) -> bytes:
-        message = ros_message(store, item)
-        message.is_bigendian = 1
-        return bytes(store.serialize_cdr(message, how_kind))
-
-    how_kind = how[CAMERA].type
-    how[CAMERA] = how[CAMERA]._replace(encode=encode)
-    stream = read(write_mcap(tmp_path / "run.mcap", recording, how), arm()).streams["front"]
-    np.testing.assert_array_equal(stream.frames(range(3)), recording.pictures)
 
 
 def test_inspect_doctor_and_eval_look_at_the_embodiments_episodes(tmp_path, monkeypatch) -> None:
@@ -238,8 +216,6 @@ def test_real_joint_states_are_those_of_rosbags(real_data: Path) -> None:
 
 @pytest.mark.real
 def test_real_ros2_bags_hold_as_many_messages_as_their_metadata_says(real_data: Path) -> None:
-    import yaml
-
     seen = 0
     for path in sorted((real_data / "ros2").rglob("metadata.yaml")):
         stated = yaml.safe_load(path.read_text())["rosbag2_bagfile_information"]
@@ -247,24 +223,6 @@ def test_real_ros2_bags_hold_as_many_messages_as_their_metadata_says(real_data: 
         assert found == stated["message_count"] == Bag(path.parent).counts().total(), path
         seen += 1
     assert seen >= 15
-
-
-@pytest.mark.real
-def test_ros2_twins_in_sqlite_and_mcap_hold_the_same_values(real_data: Path) -> None:
-    folder = real_data / "ros2" / "rosbag2" / "rosbag2_tests" / "resources"
-    store = get_typestore(Stores.ROS2_JAZZY)
-    raw = [
-        sorted(
-            (r.channel.topic, r.log_ns, bytes(r.data)) for _, r in Bag(folder / kind / "cdr_test").records()
-        )
-        for kind in ("mcap", "sqlite3")
-    ]
-    assert raw[0] == raw[1] and store
-    values = [
-        decode(record.channel, record.data, "").float64_values.tolist()
-        for _, record in Bag(folder / "mcap" / "cdr_test").records(RecordFilter(frozenset({"/array_topic"})))
-    ]
-    assert len(values) == 4 and all(len(value) == 3 for value in values)
 
 
 @pytest.mark.real
@@ -318,8 +276,6 @@ def test_a_real_recording_with_pictures_becomes_a_clip(real_data: Path) -> None:
     np.testing.assert_array_equal(clip.states, np.float32([[m["width"]] for m in calibrations]))
     frames = clip.frames_at("cam", np.arange(len(clip)))
     assert frames.shape == (10, 360, 520, 3)
-    import base64
-
     first = base64.b64decode(next(m["data"] for topic, m in messages if topic == "/image/compressed"))
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     expected = cv2.imdecode(np.frombuffer(first, np.uint8), flags)[..., ::-1]
@@ -327,10 +283,8 @@ def test_a_real_recording_with_pictures_becomes_a_clip(real_data: Path) -> None:
 
 
 @pytest.mark.real
-def test_an_empty_bag_and_one_without_messages_are_told(real_data: Path) -> None:
+def test_a_bag_without_messages_is_told(real_data: Path) -> None:
     folder = real_data / "ros1" / "foxglove" / "fixtures"
-    with pytest.raises(SourceError, match="is empty"):
-        SOURCE.inspect(str(folder / "empty-file.bag"))
     with pytest.raises(SourceError, match="no bag holds a message"):
         SOURCE.inspect(str(folder / "no-messages.bag"))
     with pytest.raises(EpisodeError, match="it has no topics"):

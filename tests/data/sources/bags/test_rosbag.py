@@ -60,13 +60,6 @@ def test_every_kind_is_recognised_and_counted_without_decoding(kind, bags, recor
     assert ref.fingerprint
 
 
-def test_pictures_come_in_any_order_and_repeated(bags: dict[str, Path], recording: Recording) -> None:
-    stream = read(bags["mcap-json"], arm()).streams["front"]
-    order = [7, 0, 7, 3, 9]
-    np.testing.assert_array_equal(stream.frames(order), recording.pictures[order])
-    assert stream.frames([]).shape[0] == 0
-
-
 def test_stamp_receive_takes_log_times(bags: dict[str, Path], recording: Recording) -> None:
     forced = arm(**{"max_skew_ms: 60": "stamp: receive"})
     episode = read(bags["ros1"], forced)

@@ -167,15 +167,6 @@ def test_inspect_tells_of_a_key_of_varying_length_as_a_finding(tmp_path, caplog,
     assert not caplog.records and capsys.readouterr().err == ""
 
 
-def test_unpacked_lists_are_read_like_packed_ones():
-    unpacked = b"\x0d" + struct.pack("<f", 1.5) + b"\x0a\x04" + struct.pack("<f", -2.0)
-    feature = b"\x12" + bytes([len(unpacked)]) + unpacked
-    entry = b"\x0a\x01x\x12" + bytes([len(feature)]) + feature
-    features = b"\x0a" + bytes([len(entry)]) + entry
-    example = Example(b"\x0a" + bytes([len(features)]) + features, "e")
-    assert example.numbers("x").tolist() == [1.5, -2.0]
-
-
 @pytest.mark.parametrize(
     "texts", [["lift", "raise", "pick up"] * 2, ["", "lift"]], ids=["three a step", "late"]
 )
