@@ -6,7 +6,6 @@ import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
 from functools import lru_cache
 from itertools import groupby
 from operator import itemgetter
@@ -58,7 +57,8 @@ class Bag:
 
     def __init__(self, path: Path, root: Path | None = None, parts: Sequence[Path] = ()) -> None:
         self.path = path
-        self._metadata = _metadata(path) if path.is_dir() else {}
+        described = path / "metadata.yaml"
+        self._metadata = _information(described, _state(described)) if path.is_dir() else {}
         self.remarks: tuple[str, ...] = ()  # what its folder has beside what is read, one sentence each
         self._paths = [path, *parts]
         self._stated = False  # whether the metadata describes all of its files
@@ -146,13 +146,8 @@ class Bag:
 
     def state(self) -> tuple[tuple[str, int, int], ...]:
         """Return size and time of change of its files, and of sqlite3's logs; the key for caching it."""
-        if isinstance(self.path, RemotePath):
-            found = {path: path.info() for path in self._paths if isinstance(path, RemotePath)}
-            return tuple((f"{path} {mark(info)}", int(info["size"] or 0), 0) for path, info in found.items())
-        logs = (path.with_name(path.name + "-wal") for path in self._paths)
-        with reading(self.path):
-            stats = {path: path.stat() for path in [*self._paths, *(log for log in logs if log.is_file())]}
-        return tuple((str(path), stat.st_size, stat.st_mtime_ns) for path, stat in stats.items())
+        logs = [] if is_remote(self.path) else [path.with_name(path.name + "-wal") for path in self._paths]
+        return tuple(_state(path) for path in [*self._paths, *(log for log in logs if log.is_file())])
 
     def _plain_record(self, record: Record) -> Record:
         return record._replace(data=self._unpack(record.data)) if self._message_packed else record
@@ -248,21 +243,18 @@ def _container(path: Path, chunks: Chunks) -> Container:
     raise damaged(path, f"begins with {magic[:13]!r}, which is not how {known} begins")
 
 
-def _metadata(folder: Path) -> dict[str, Any]:
-    where = folder / "metadata.yaml"
-    with suppress(OSError):  # reading it raises its error
-        if not is_remote(where):
-            stat = where.stat()
-            return _kept_information(where, stat.st_size, stat.st_mtime_ns)
-    return _information(where)
+def _state(path: Path) -> tuple[str, int, int]:
+    """Return what changes when a file does."""
+    if isinstance(path, RemotePath):
+        found = path.info()
+        return f"{path} {mark(found)}", int(found["size"] or 0), 0
+    with reading(path):
+        stat = path.stat()
+    return str(path), stat.st_size, stat.st_mtime_ns
 
 
 @lru_cache(maxsize=16)  # each segment of a bag asks, and thousands of files or topics take half a second
-def _kept_information(where: Path, size: int, changed: int) -> dict[str, Any]:
-    return _information(where)
-
-
-def _information(where: Path) -> dict[str, Any]:
+def _information(where: Path, state: object) -> dict[str, Any]:
     values = read_yaml(where, EpisodeError)
     information = values.get("rosbag2_bagfile_information") if isinstance(values, dict) else None
     if not isinstance(information, dict) or not isinstance(information.get("relative_file_paths"), list):

@@ -201,7 +201,7 @@ def _check_keys(folder: RldsFolder, embodiment: Embodiment) -> None:
         feature = _step_feature(folder, camera.key)
         if not is_camera(feature):
             images = [key for key, found in folder.step_features.items() if is_camera(found)]
-            fault = f"{camera.key} is {_described(feature)} of {feature.dtype}, not a colour image"
+            fault = f"{camera.key} holds {feature.kind} values ({feature.dtype}), not colour images"
             raise SourceError(folder.uri, fault, f"its images: {', '.join(images) or 'none'}")
     for part in embodiment.components:
         _check_component(folder, part)
@@ -212,7 +212,8 @@ def _check_keys(folder: RldsFolder, embodiment: Embodiment) -> None:
 def _check_component(folder: RldsFolder, part: Component) -> None:
     feature = _step_feature(folder, part.key)
     if feature.kind != "number":
-        raise SourceError(folder.uri, f"{part.key} is {_described(feature)} of {feature.dtype}, not numbers")
+        fault = f"{part.key} holds {feature.kind} values ({feature.dtype}), not numbers"
+        raise SourceError(folder.uri, fault)
     wanted = part.slice[1] if part.slice else part.dims
     if feature.width is not None and (feature.width < wanted or (not part.slice and feature.width > wanted)):
         fault = f"{part.key} has {feature.width} values per step, the embodiment says {wanted}"
@@ -237,13 +238,8 @@ def _text_feature(folder: RldsFolder, key: str) -> RldsFeature:
         return feature
     if inside and feature.kind == "number" and feature.dtype.startswith(("int", "uint")):  # codes of letters
         return feature
-    raise SourceError(folder.uri, f"source.instruction: {key} is {_described(feature)}, not text")
-
-
-def _described(feature: RldsFeature) -> str:
-    if feature.kind == "image":
-        return "a sequence of images per step" if len(feature.nesting) > 1 else "an image"
-    return {"number": "a tensor", "text": "text"}.get(feature.kind, "a feature")
+    fault = f"source.instruction: {key} holds {feature.kind} values ({feature.dtype}), not text"
+    raise SourceError(folder.uri, fault)
 
 
 # -- one episode

@@ -96,9 +96,9 @@ ALL: dict[str, Row] = {  # no episode can be used
     "nothing": (shutil.rmtree, "does not exist"),
     "no such key": (untouched, "no key 'action/mov'.*did you mean 'action/move'", acts("action/mov", 2)),
     "another width": (untouched, "state has 3 values per step, the embodiment says 7", WIDE),
-    "text": (untouched, "text is text of string, not numbers", acts("text", 1)),
-    "numbers": (untouched, "action/move is a tensor of float32, not a colour image", sees("action/move")),
-    "depth": (untouched, "depth is an image of uint16, not a colour image", sees("depth")),
+    "text": (untouched, r"text holds text values \(string\), not numbers", acts("text", 1)),
+    "numbers": (untouched, r"move holds number values \(float32\), not colour images", sees("action/move")),
+    "depth": (untouched, r"depth holds image values \(uint16\), not colour images", sees("depth")),
 }
 
 ALL |= {
