@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from mcap.writer import CompressionType
-from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
@@ -131,19 +130,9 @@ class Encoded(NamedTuple):
 
 
 def write_mcap(path: Path, recording: Recording, how: dict[str, Encoded], **options: Any) -> Path:
-    """An MCAP file by mcap's writer."""
-    with path.open("wb") as file:
-        writer = McapWriter(file, chunk_size=8192, **options)
-        writer.start()
-        channels = {}
-        for topic, encoded in how.items():
-            schema = writer.register_schema(encoded.type, encoded.schema_encoding, encoded.schema)
-            channels[topic] = writer.register_channel(topic, encoded.encoding, schema)
-        for item in items(recording):
-            data = how[item.topic].encode(item)
-            writer.add_message(channels[item.topic], item.log_ns, data, item.log_ns)
-        writer.finish()
-    return path
+    sent = ((item, how[item.topic]) for item in items(recording))
+    messages = ((item.topic, ros2.Kind(*how[:4]), item.log_ns, how.encode(item)) for item, how in sent)
+    return ros2.write_mcap(path, messages, chunk_size=8192, **options)
 
 
 def as_ros1() -> dict[str, Encoded]:

@@ -3,14 +3,13 @@
 The camera ticks at 10 Hz with header stamps, received 5 ms late; everything else has no header.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from mcap.writer import CompressionType, IndexType
-from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
@@ -110,25 +109,18 @@ def sqlite(folder: Path, run: Run) -> Path:
     return folder / "run"
 
 
-def mcap(folder: Path, run: Run, more: list[tuple[str, str, str, float, bytes]] = [], **options: Any) -> Path:  # noqa: B006
+def mcap(
+    folder: Path, run: Run, more: Iterable[tuple[str, str, str, float, bytes]] = (), **options: Any
+) -> Path:
     """An MCAP file; `more` are messages already encoded: topic, type, definition, seconds, bytes."""
-    store, items = ros2.TYPES, []
+    messages = []
     for item in run.messages():
-        kind = TYPES[item.topic]
-        data = bytes(store.serialize_cdr(_message(store, run, item), kind))
-        items.append((item.topic, kind, "", item.at_s, data))
-    channels: dict[str, int] = {}
-    with (folder / "run.mcap").open("wb") as file:
-        writer = McapWriter(file, chunk_size=options.pop("chunk_size", 4096), **options)
-        writer.start()
-        for topic, kind, text, at_s, data in sorted([*items, *more], key=lambda item: item[3]):
-            if topic not in channels:
-                text = text or store.generate_msgdef(kind, ros_version=2)[0]
-                schema = writer.register_schema(kind, "ros2msg", text.encode())
-                channels[topic] = writer.register_channel(topic, "cdr", schema)
-            writer.add_message(channels[topic], _ns(at_s), data, _ns(at_s))
-        writer.finish()
-    return folder / "run.mcap"
+        message = _message(ros2.TYPES, run, item)
+        messages.append((item.topic, ros2.kind_of(message), _ns(item.at_s), ros2.cdr(message)))
+    for topic, name, text, at_s, data in more:
+        messages.append((topic, ros2.Kind(name, "ros2msg", text.encode(), "cdr"), _ns(at_s), data))
+    messages.sort(key=lambda message: message[2])
+    return ros2.write_mcap(folder / "run.mcap", messages, **{"chunk_size": 4096} | options)
 
 
 PLAIN, ZSTD = CompressionType.NONE, CompressionType.ZSTD

@@ -4,11 +4,12 @@ import shutil
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import av
 import cv2
 import numpy as np
+from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -43,6 +44,40 @@ def send(writer: Ros1Writer | Writer, messages: Iterable[Sent], store: Any = TYP
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, kind, typestore=store)
             writer.write(connections[topic], received, serialize(message, kind))
+
+
+class Kind(NamedTuple):
+    """The type of an MCAP channel's messages; without a schema, JSON."""
+
+    type: str = ""
+    schema_encoding: str = ""
+    schema: bytes = b""
+    encoding: str = "json"
+
+
+def kind_of(message: Any) -> Kind:
+    """Return the kind of a message of ROS 2."""
+    text = TYPES.generate_msgdef(message.__msgtype__, ros_version=2)[0]
+    return Kind(message.__msgtype__, "ros2msg", text.encode(), "cdr")
+
+
+def cdr(message: Any) -> bytes:
+    return bytes(TYPES.serialize_cdr(message, message.__msgtype__))
+
+
+def write_mcap(path: Path, messages: Iterable[tuple[str, Kind, int, bytes]], **options: Any) -> Path:
+    """An MCAP file by mcap's writer, of topics, kinds, times of receipt and encoded messages."""
+    with path.open("wb") as file:
+        writer = McapWriter(file, **options)
+        writer.start()
+        channels: dict[tuple[str, Kind], int] = {}
+        for topic, kind, received, data in messages:
+            if (topic, kind) not in channels:
+                schema = writer.register_schema(*kind[:3]) if kind.type else 0
+                channels[topic, kind] = writer.register_channel(topic, kind.encoding, schema)
+            writer.add_message(channels[topic, kind], received, data, received)
+        writer.finish()
+    return path
 
 
 def stamp(ns: int, store: Any = TYPES) -> Any:

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import yaml
 from mcap.reader import NonSeekingReader, make_reader
-from mcap.writer import Writer
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -102,19 +101,12 @@ def protobuf_encoder(name: str) -> tuple[str, str, bytes, Callable[[int, dict[st
 
 def write(path: Path, name: str, encoding: str, pictures: np.ndarray) -> Path:
     made = protobuf_encoder(name) if encoding == "protobuf" else ros_encoder(name, encoding)
-    kind, schema_encoding, schema, encode = made
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=4096)
-        writer.start()
-        camera = writer.register_channel(
-            "/video", encoding, writer.register_schema(kind, schema_encoding, schema)
-        )
-        number = writer.register_channel("/n", "json", 0)
-        for i, fields in enumerate(values(name, pictures)):
-            writer.add_message(camera, (i + 1) * 10**9 + 900, encode(i, fields), i)
-            writer.add_message(number, (i + 1) * 10**9, b'{"value": 1}', i)
-        writer.finish()
-    return path
+    kind, encode = ros2.Kind(*made[:3], encoding), made[3]
+    messages = []
+    for i, fields in enumerate(values(name, pictures)):
+        messages.append(("/video", kind, (i + 1) * 10**9 + 900, encode(i, fields)))
+        messages.append(("/n", ros2.Kind(), (i + 1) * 10**9, b'{"value": 1}'))
+    return ros2.write_mcap(path, messages, chunk_size=4096)
 
 
 @pytest.mark.parametrize("encoding", ["cdr", "ros1", "protobuf"])

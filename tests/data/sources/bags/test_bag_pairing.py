@@ -4,7 +4,6 @@ Frame i of the camera shows i, and action i is i, so every pair that is off show
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.bags.clocks import SECOND_NS, MessageTimes, sorted_by
 from hma_data.storage.yaml_io import parse_yaml
 from tests.data import ros2
-from tests.data.bag_files import SOURCE, arm, make_recording, read, write_ros1
+from tests.data.bag_files import SOURCE
 
 PERIOD_NS = SECOND_NS // 10
 FRAMES = 40
@@ -181,12 +180,6 @@ def test_a_clock_stepped_forward_is_a_pause(tmp_path: Path) -> None:
     assert pairs(path, robot()) == IN_ORDER
 
 
-def test_parts_stored_in_another_order_are_sorted() -> None:
-    times = np.concatenate([np.arange(20, 40), np.arange(20)]) * PERIOD_NS
-    assert sorted_by(times, np.repeat([0, 1], 20)).tolist() == [*range(20, 40), *range(20)]
-    assert sorted_by(times, np.zeros(40, np.int64)) is None
-
-
 def test_infer_measures_on_the_clock_that_it_proposes(tmp_path: Path) -> None:
     path = bag(tmp_path / "run", restarted, stamped=True)
     values = parse_yaml(infer(str(path), "x"), "x")
@@ -221,12 +214,6 @@ COUNT = 20
 SECOND = 10**9
 
 
-def test_one_stamp_of_zero_is_no_shift(tmp_path: Path) -> None:
-    times = np.arange(COUNT) * SECOND // 10
-    order = sorted_by(np.where(np.arange(COUNT) == 0, 0, times + SECOND), np.zeros(COUNT, np.int64))
-    np.testing.assert_array_equal(order, np.arange(COUNT))
-
-
 def test_messages_swapped_on_arrival_take_the_order_of_their_stamps() -> None:
     times = np.arange(COUNT) * SECOND // 10
     times[[4, 5]] = times[[5, 4]]
@@ -246,10 +233,3 @@ def test_a_clock_that_is_set_back_is_never_sorted(back_s: float) -> None:
     parts = np.repeat([1, 0], 20)  # the parts of one recording may be stored in any order
     if back_s > 2:
         assert sorted_by(times, parts) is not None
-
-
-def test_the_advice_for_a_clock_set_back_never_mixes_the_two_runs(tmp_path: Path) -> None:
-    shift = np.where(np.arange(COUNT) < COUNT // 2, 0, -60 * SECOND)
-    path = write_ros1(tmp_path / "run.bag", replace(make_recording(COUNT), stamp_shift_ns=shift))
-    with pytest.raises(EpisodeError, match=r"go back by 59\.9 s at message 10.*gap_s.*stamp: receive"):
-        read(path, arm())

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import zstandard
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType
 
 from hma_data.episodes.episode import OneByOne
 from hma_data.episodes.images import prepare, prepared
@@ -155,18 +155,13 @@ def write_video(path: Path, codec: str, name: str, options: dict[str, str], drop
     pictures = gradients(30)
     packets = [data for _, data in ros2.packets(pictures, codec, options, gop=10)]
     assert len(packets) == 30
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=4096)
-        writer.start()
-        schema = writer.register_schema("foxglove.CompressedVideo", "jsonschema", b"{}")
-        channel = writer.register_channel("/video", "json", schema)
-        number = writer.register_channel("/n", "json", 0)
-        for i, packet in list(enumerate(packets))[drop:]:
-            stamp, data = {"sec": 1 + i, "nsec": 0}, base64.b64encode(packet).decode()
-            text = {"timestamp": stamp, "format": name, "data": data}
-            writer.add_message(channel, (1 + i) * 10**9, json.dumps(text).encode(), i)
-            writer.add_message(number, (1 + i) * 10**9, b'{"value": 1}', i)
-        writer.finish()
+    video, messages = ros2.Kind("foxglove.CompressedVideo", "jsonschema", b"{}"), []
+    for i, packet in list(enumerate(packets))[drop:]:
+        stamp, data = {"sec": 1 + i, "nsec": 0}, base64.b64encode(packet).decode()
+        text = json.dumps({"timestamp": stamp, "format": name, "data": data})
+        messages.append(("/video", video, (1 + i) * 10**9, text.encode()))
+        messages.append(("/n", ros2.Kind(), (1 + i) * 10**9, b'{"value": 1}'))
+    ros2.write_mcap(path, messages, chunk_size=4096)
     return pictures
 
 

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 from google.protobuf import descriptor_pb2
-from mcap.writer import Writer
 
 from hma_data.errors import EpisodeError, SourceError
 from hma_data.inspection.infer import infer
@@ -131,25 +130,14 @@ def test_a_field_of_a_list_is_read_from_each_and_may_be_sliced(tmp_path: Path) -
 
 def mcap_of_two_types(path: Path, measured: Sequence[str] = ()) -> Path:
     """JointState with i, and an array with 500 + i a millisecond later, both on /cmd; `measured` has i."""
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start("ros2")
-        channels = {}
-        for i in range(FRAMES):
-            for topic, message, late in (
-                ("/cam", ros2.image(at(i), i), 0),
-                *((topic, ros2.joints(at(i), ["a"], [i]), 0) for topic in ("/cmd", *measured)),
-                ("/cmd", ros2.array([500 + i]), 10**6),
-            ):
-                kind = message.__msgtype__
-                if (topic, kind) not in channels:
-                    text = ros2.TYPES.generate_msgdef(kind, ros_version=2)[0].encode()
-                    schema = writer.register_schema(kind, "ros2msg", text)
-                    channels[topic, kind] = writer.register_channel(topic, "cdr", schema)
-                data = bytes(ros2.TYPES.serialize_cdr(message, kind))
-                writer.add_message(channels[topic, kind], at(i) + late, data, at(i))
-        writer.finish()
-    return path
+    messages = []
+    for i in range(FRAMES):
+        joints = ros2.joints(at(i), ["a"], [i])
+        sent = [("/cam", ros2.image(at(i), i)), *((topic, joints) for topic in ("/cmd", *measured))]
+        messages += [(topic, ros2.kind_of(one), at(i), ros2.cdr(one)) for topic, one in sent]
+        late = ros2.array([500 + i])
+        messages.append(("/cmd", ros2.kind_of(late), at(i) + 10**6, ros2.cdr(late)))
+    return ros2.write_mcap(path, messages)
 
 
 def test_a_topic_of_two_types_is_refused(tmp_path: Path) -> None:

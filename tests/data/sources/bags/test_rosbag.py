@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from hma_data.episodes.align import to_clip
@@ -16,7 +17,9 @@ from hma_data.errors import EpisodeError, SourceError
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.bags.bag import Bag
 from hma_data.sources.bags.messages import decode
+from hma_data.sources.bags.topic_track import TopicTrack
 from hma_data.sources.detect import detect
+from tests.data import ros2
 from tests.data.bag_files import (
     CAMERA,
     COMMAND,
@@ -95,20 +98,11 @@ def test_a_bag_without_index_is_read_to_its_end(bags, recording, tmp_path) -> No
 
 
 def test_messages_out_of_order_come_in_order_of_receipt(tmp_path: Path) -> None:
-    from mcap.writer import Writer
-
-    path = tmp_path / "shuffled.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=200)
-        writer.start()
-        channel = writer.register_channel("/n", "json", 0)
-        for i in np.random.default_rng(1).permutation(50):
-            writer.add_message(channel, int(i) * 1000 + 1, json.dumps({"value": int(i)}).encode(), 0)
-        writer.finish()
+    order = np.random.default_rng(1).permutation(50).tolist()
+    messages = (("/n", ros2.Kind(), i * 1000 + 1, json.dumps({"value": i}).encode()) for i in order)
+    path = ros2.write_mcap(tmp_path / "shuffled.mcap", messages, chunk_size=200)
     with path.open("rb") as file:
         expected = [json.loads(message.data)["value"] for _, _, message in make_reader(file).iter_messages()]
-    from hma_data.sources.bags.topic_track import TopicTrack
-
     track, values = TopicTrack("/n", "x.bag"), []
     for place, record in Bag(path).records():
         message = decode(record.channel, record.data, "")
@@ -125,33 +119,20 @@ def numbers_bag(tmp_path: Path) -> Path:
     joint_state = store.types["sensor_msgs/msg/JointState"]
     header = store.types["std_msgs/msg/Header"](0, store.types["builtin_interfaces/msg/Time"](0, 0), "")
     image = store.types["sensor_msgs/msg/Image"]
-    path = tmp_path / "numbers.bag"
-    from rosbags.rosbag1 import Writer
-
-    with Writer(path) as writer:
-        topics = {
-            "/cmd": "geometry_msgs/msg/Twist",
-            "/cmd.linear": "geometry_msgs/msg/Vector3",
-            "/joints": "sensor_msgs/msg/JointState",
-            "/cam": "sensor_msgs/msg/Image",
-            "/text": "std_msgs/msg/String",
+    messages, none = [], np.zeros(0)
+    for i in range(4):
+        gripper = joint_state(header, ["gripper"], np.array([float(i)]), none, none)
+        values = {
+            "/cmd": twist(vector(i, 1, 2), vector(3, 4, 5)),
+            "/cmd.linear": vector(-i, -1, -2),
+            "/cam": image(header, 2, 2, "mono8", 0, 2, np.full(4, i, np.uint8)),
+            "/text": store.types["std_msgs/msg/String"]("pick the cube" if i else ""),
+            "/joints": joint_state(header, ["a", "b"], np.array([i, 10.0]), none, none),
         }
-        made = {topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in topics.items()}
-        none = np.zeros(0)
-        for i in range(4):
-            values = {
-                "/cmd": twist(vector(i, 1, 2), vector(3, 4, 5)),
-                "/cmd.linear": vector(-i, -1, -2),
-                "/cam": image(header, 2, 2, "mono8", 0, 2, np.full(4, i, np.uint8)),
-                "/text": store.types["std_msgs/msg/String"]("pick the cube" if i else ""),
-                "/joints": joint_state(header, ["a", "b"], np.array([i, 10.0]), none, none),
-            }
-            for topic, value in values.items():
-                writer.write(made[topic], i * 10**8 + 1, store.serialize_ros1(value, topics[topic]))
-            gripper = joint_state(header, ["gripper"], np.array([float(i)]), none, none)
-            data = store.serialize_ros1(gripper, topics["/joints"])
-            writer.write(made["/joints"], i * 10**8 + 50_000_000, data)
-    return path
+        messages += [(topic, value, i * 10**8 + 1) for topic, value in values.items()]
+        messages.append(("/joints", gripper, i * 10**8 + 50_000_000))
+    ros2.send(Writer(tmp_path / "numbers.bag"), messages, store)
+    return tmp_path / "numbers.bag"
 
 
 def keyed(key: str, dims: int, more: str = "") -> Embodiment:
