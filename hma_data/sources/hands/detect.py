@@ -30,7 +30,7 @@ from hma_data.arrays import Array, Float32s, Floats, Images
 from hma_data.episodes.images import opencv
 from hma_data.errors import MissingDependencyError, SourceError, install_command
 from hma_data.storage.files import short_sha256
-from hma_data.storage.kinds import LFS, unreadable
+from hma_data.storage.kinds import unreadable
 from hma_data.storage.paths import StrPath, as_text
 
 ENVIRONMENT = "HMA_HAND_MODELS"
@@ -123,10 +123,6 @@ class HandNetwork:
             self._interpreter = interpreter(model_content=content, num_threads=1)
             self._interpreter.allocate_tensors()
         except (ValueError, RuntimeError) as fault:
-            if content.startswith(LFS):
-                raise SourceError(
-                    where, "holds Git LFS pointers", "run git lfs pull in its folder"
-                ) from fault
             raise SourceError(where, f"cannot be run: {fault}", _REMEDY) from fault
         (given, *_) = self._interpreter.get_input_details()
         outputs: dict[int, list[int]] = defaultdict(list)

@@ -29,9 +29,6 @@ def demos(tmp_path: Path) -> Path:
     with h5py.File(path, "w") as file:
         for i in range(12):
             fill(file.create_group(f"data/demo_{i}"), T + i, i)
-        names = [f"demo_{i}".encode() for i in range(12)]
-        file["mask/train"], file["mask/valid"] = names[:10], names[10:]
-        file["mask/few"] = names[:2]
         arguments = {"env_name": "Lift", "env_kwargs": {"control_freq": 20, "robots": ["Panda"]}}
         file["data"].attrs["env_args"] = json.dumps(arguments)
     return path
@@ -48,14 +45,6 @@ def test_values_and_pictures_equal_h5py(demos: Path) -> None:
     np.testing.assert_array_equal(stream.frames(range(len(stored))), stored)
     np.testing.assert_array_equal(stream.frames([9, 2, 2, 15]), stored[[9, 2, 2, 15]])
     np.testing.assert_allclose(stream.timestamps, np.arange(16) / 20)
-
-
-def test_masks_are_the_splits(demos: Path) -> None:
-    refs = open_source("hdf5").index(str(demos), embodiment())
-    assert [ref.split for ref in refs] == ["train"] * 10 + ["val"] * 2
-    assert [ref.frames for ref in refs] == [T + i for i in range(12)]
-    with pytest.raises(SourceError, match=r"no mask 'rest'.*few, train, valid"):
-        open_source("hdf5").index(str(demos), embodiment(source__split="rest"))
 
 
 def test_a_folder_names_episodes_by_file(demos: Path, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from hma_data.episodes.align import to_clip
-from hma_data.errors import EpisodeError
+from hma_data.errors import EpisodeError, SourceError
 from hma_data.inspection.inspect import inspect_recording
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.base import open_source
@@ -160,7 +160,10 @@ def test_masks_by_their_names(tmp_path, masks, expected) -> None:
             fill(file.create_group(f"data/demo_{i}"))
         for name, demos in masks.items():
             file[f"mask/{name}"] = np.array([f"data/demo_{i}".encode() for i in demos], "S16")
-    assert [ref.split for ref in open_source("hdf5").index(str(path))] == expected
+    refs = open_source("hdf5").index(str(path))
+    assert [(ref.split, ref.frames) for ref in refs] == [(split, T) for split in expected]
+    with pytest.raises(SourceError, match=f"no mask 'rest'.*{', '.join(sorted(masks))}"):
+        open_source("hdf5").index(str(path), embodiment(source__split="rest"))
     for name, demos in masks.items():
         chosen = open_source("hdf5").index(str(path), embodiment(source__split=name))
         assert [ref.id for ref in chosen] == [f"demo_{i}" for i in demos]
