@@ -300,7 +300,7 @@ class Survey:
             facts={name: fact for name, fact in facts.items() if fact},
             looked_at=len(self.looked),
             findings=self.findings(measured),
-            checks=self.checks(),
+            checks=tuple(check for check in CHECKS if check in self.made),
             **about,
         )
 
@@ -343,10 +343,6 @@ class Survey:
         ]  # fmt: skip
         order = list(CHECKS)
         return tuple(sorted(found, key=lambda one: order.index(one.check) if one.check in order else 99))
-
-    def checks(self) -> tuple[str, ...]:
-        """Return the checks that could be made, in their order."""
-        return tuple(check for check in CHECKS if check in self.made)
 
     def _readable(self, keys: Sequence[KeyInfo]) -> Iterator[Finding]:
         faulty = dict.fromkeys(name for name, _ in self._faults)

@@ -171,9 +171,9 @@ def frames_of_rows(
         after = spans[place + 1].start if place + 1 < len(spans) else np.inf
         first, last = np.searchsorted(clock, np.array([span.start, after]) + shift - 0.5 / fps)
     if last - first < len(times) or (pairing == "index" and last - first > len(times)):
-        raise EpisodeError(
-            file.path, f"has {last - first} frames{_part(span)}, the episode has {len(times)} rows"
-        )
+        part = "" if span.stop is None else f" from {span.start:.3f} to {span.stop:.3f} s"
+        fault = f"has {last - first} frames{part}, the episode has {len(times)} rows"
+        raise EpisodeError(file.path, fault)
     if pairing == "index":
         return np.arange(first, last)
     indices, off_ms = nearest(clock[first:last], span.start + shift + times)
@@ -188,7 +188,3 @@ def frames_of_rows(
         row = int(np.argmin(np.diff(indices)))
         raise EpisodeError(file.path, f"has one frame for the rows {row} and {row + 1}")
     return indices + first
-
-
-def _part(span: Span) -> str:
-    return "" if span.stop is None else f" from {span.start:.3f} to {span.stop:.3f} s"

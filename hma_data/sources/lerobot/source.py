@@ -215,7 +215,14 @@ def inspect(uri: str, meta: Metadata, episodes: int) -> Inspection:
     """See Source.inspect."""
     lengths = [row["length"] for row in meta.episodes.values()]
     survey = Survey(len(lengths))
-    _totals(meta, survey)
+    survey.made.add("files")
+    for name, stated, actual in (
+        ("total_episodes", meta.info.total_episodes, len(lengths)),
+        ("total_frames", meta.info.total_frames, sum(lengths)),
+    ):
+        if stated is not None and stated != actual:
+            said = f"info.json says {name} {stated:,}, the episodes listed make {actual:,}"
+            survey.note(Finding("files", "warn", said, numbers={"stated": stated, "listed": actual}))
     looking = _Looking(meta, survey, episodes)
     if not meta.folder.repo:
         looking.look()
@@ -227,19 +234,6 @@ def inspect(uri: str, meta: Metadata, episodes: int) -> Inspection:
         facts["rate"] = f"measured: the timestamps of the rows; meta/info.json states {meta.fps:g} Hz"
     robot = meta.info.robot_type or None
     return survey.inspection("lerobot", uri, _keys(meta), lengths, facts, hz=hz, robot=robot)
-
-
-def _totals(meta: Metadata, survey: Survey) -> None:
-    survey.made.add("files")
-    lengths = [row["length"] for row in meta.episodes.values()]
-    info = meta.info
-    for name, stated, actual in (
-        ("total_episodes", info.total_episodes, len(lengths)),
-        ("total_frames", info.total_frames, sum(lengths)),
-    ):
-        if stated is not None and stated != actual:
-            said = f"info.json says {name} {stated:,}, the episodes listed make {actual:,}"
-            survey.note(Finding("files", "warn", said, numbers={"stated": stated, "listed": actual}))
 
 
 class _Looking:
