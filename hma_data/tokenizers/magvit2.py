@@ -1,22 +1,23 @@
 """`magvit2` and `magvit2-plain`: encode with Open-MAGVIT2, the discrete tokenizer of the paper's release.
 
 Both take 256×256 images and give 16×16 ids of 18 bits, two digits of 512. They load 1X's
-`magvit2.ckpt` (the default), TencentARC's checkpoints, and plain safetensors of `encoder.*` and
-`decoder.*`. Widths, levels and blocks are derived from the weights. Some checkpoints, 1X's among them,
+`magvit2.ckpt` (the default), and plain safetensors of `encoder.*` and `decoder.*`. Widths, levels and
+blocks are derived from the weights. Some checkpoints, 1X's among them,
 hold averaged weights (`model_ema.*`) beside the plain ones: `magvit2` uses the averaged weights. The
 paper's own loader overwrites the averaged weights with the plain ones: `magvit2-plain` gives that
 loader's ids.
 
 The network is a convolutional autoencoder whose latents are reduced to their signs (lookup-free
-quantisation, Yu et al. 2024). Parameter names are those of the released checkpoints. The first
-checkpoints (1X's among them) have a plain decoder. In later ones (`adaptive`), each stage of the decoder
-has a group norm whose scale and shift come from the code.
+quantisation, Yu et al. 2024). Parameter names are those of the released checkpoints. Later checkpoints of
+Open-MAGVIT2, whose decoder has adaptive group norms, are refused.
 
 B images, S side, z channels of the code, h = S / 2^(levels-1). Pixels are in [-1, 1].
 """
 
+from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import torch
@@ -57,14 +58,12 @@ class Magvit2Config:
         z: channels of the code, which is the number of bits of a token.
         mult: channels of each level as multiples of `base`; each level except the last halves the side.
         res_blocks: residual blocks a level.
-        adaptive: whether the decoder has adaptive group norms.
     """
 
     base: int = 128
     z: int = 18
     mult: tuple[int, ...] = (1, 1, 2, 2, 4)
     res_blocks: int = 2
-    adaptive: bool = False
 
     @property
     def stride(self) -> int:
@@ -100,16 +99,9 @@ def _blocks(before: int, after: int, count: int) -> nn.Sequential:
     return nn.Sequential(*(ResBlock(before if i == 0 else after, after) for i in range(count)))
 
 
-class DownLevel(nn.Module):
-    """Residual blocks, then a strided convolution that halves the side, except on the last level."""
-
-    def __init__(self, before: int, after: int, count: int, last: bool) -> None:
-        super().__init__()
-        self.block = _blocks(before, after, count)
-        self.downsample = nn.Identity() if last else nn.Conv2d(after, after, 3, stride=2, padding=1)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.downsample(self.block(x))
+def _level(blocks: nn.Sequential, name: str, change: nn.Module | None) -> nn.Sequential:
+    """Return residual blocks, then what halves or doubles the side, under the release's names."""
+    return nn.Sequential(OrderedDict({"block": blocks} | ({name: change} if change else {})))
 
 
 class Upsample(nn.Module):
@@ -128,43 +120,17 @@ class Upsample(nn.Module):
         return cells.permute(0, 3, 4, 1, 5, 2).reshape(batch, width, 2 * height, 2 * side)
 
 
-class UpLevel(nn.Module):
-    """Residual blocks, then an upsampling that doubles the side, except on the finest level."""
-
-    def __init__(self, before: int, after: int, count: int, finest: bool) -> None:
-        super().__init__()
-        self.block = _blocks(before, after, count)
-        self.upsample = nn.Identity() if finest else Upsample(after)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.upsample(self.block(x))
-
-
-class AdaptiveNorm(nn.Module):
-    """A group norm whose scale comes from the code's spread over the image, and its shift from the mean."""
-
-    def __init__(self, z: int, width: int) -> None:
-        super().__init__()
-        self.gamma, self.beta = nn.Linear(z, width), nn.Linear(z, width)
-
-    def forward(self, x: Tensor, codes: Tensor) -> Tensor:
-        flat = codes.flatten(2)
-        scale = self.gamma((flat.var(dim=2) + EPS).sqrt())
-        shift = self.beta(flat.mean(dim=2))
-        return functional.group_norm(x, GROUPS, eps=EPS) * scale[:, :, None, None] + shift[:, :, None, None]
-
-
 class Encoder(nn.Module):
     """The encoder: (B, 3, S, S) pixels -> (B, z, h, h), whose signs are the code."""
 
     def __init__(self, config: Magvit2Config) -> None:
         super().__init__()
         widths = [config.base * m for m in (1, *config.mult)]
-        last = len(config.mult) - 1
         self.conv_in = nn.Conv2d(3, config.base, 3, padding=1, bias=False)
-        self.down = nn.Sequential(
-            *(DownLevel(widths[i], widths[i + 1], config.res_blocks, i == last) for i in range(last + 1))
-        )
+        self.down = nn.Sequential()
+        for i, (before, after) in enumerate(pairwise(widths), start=1):
+            halving = nn.Conv2d(after, after, 3, stride=2, padding=1) if i < len(config.mult) else None
+            self.down.append(_level(_blocks(before, after, config.res_blocks), "downsample", halving))
         self.mid_block = _blocks(widths[-1], widths[-1], config.res_blocks)
         self.norm_out = nn.GroupNorm(GROUPS, widths[-1], eps=EPS)
         self.conv_out = nn.Conv2d(widths[-1], config.z, 1)
@@ -179,23 +145,20 @@ class Decoder(nn.Module):
 
     def __init__(self, config: Magvit2Config) -> None:
         super().__init__()
-        after = [config.base * m for m in config.mult]
-        before = [*after[1:], after[-1]]  # input widths; a level takes the output of the coarser one
-        levels = range(len(after))
-        self.conv_in = nn.Conv2d(config.z, after[-1], 3, padding=1)
-        self.mid_block = _blocks(after[-1], after[-1], config.res_blocks)
-        self.up = nn.ModuleList(UpLevel(before[i], after[i], config.res_blocks, i == 0) for i in levels)
-        norms = (AdaptiveNorm(config.z, before[i]) for i in levels if config.adaptive)
-        self.adaptive = nn.ModuleList(norms)
-        self.norm_out = nn.GroupNorm(GROUPS, after[0], eps=EPS)
-        self.conv_out = nn.Conv2d(after[0], 3, 3, padding=1)
+        widths = [config.base * m for m in (*config.mult, config.mult[-1])]
+        self.conv_in = nn.Conv2d(config.z, widths[-1], 3, padding=1)
+        self.mid_block = _blocks(widths[-1], widths[-1], config.res_blocks)
+        self.up = nn.ModuleList()  # the finest level first; each takes the output of the next
+        for after, before in pairwise(widths):
+            doubling = Upsample(after) if len(self.up) else None
+            self.up.append(_level(_blocks(before, after, config.res_blocks), "upsample", doubling))
+        self.norm_out = nn.GroupNorm(GROUPS, widths[0], eps=EPS)
+        self.conv_out = nn.Conv2d(widths[0], 3, 3, padding=1)
 
     def forward(self, codes: Tensor) -> Tensor:
         x = self.mid_block(self.conv_in(codes))
-        for i in reversed(range(len(self.up))):
-            if self.adaptive:
-                x = self.adaptive[i](x, codes)
-            x = self.up[i](x)
+        for level in reversed(self.up):
+            x = level(x)
         return self.conv_out(functional.silu(self.norm_out(x)))
 
 
@@ -254,7 +217,6 @@ def derive_config(tensors: Mapping[str, Tensor]) -> Magvit2Config:
         z=tensors["encoder.conv_out.weight"].shape[0],
         mult=tuple(width // base for width in widths),
         res_blocks=len(numbers(tensors, "encoder.down.0.block.")),
-        adaptive=any(name.startswith("decoder.adaptive.") for name in tensors),
     )
 
 

@@ -85,8 +85,6 @@ def norm(state: dict[str, Tensor], name: str, x: Tensor) -> Tensor:
     grouped = x.view(x.shape[0], 32, -1)
     mean, variance = grouped.mean(2, keepdim=True), grouped.var(2, unbiased=False, keepdim=True)
     whole = ((grouped - mean) / (variance + 1e-6).sqrt()).view_as(x)
-    if f"{name}.weight" not in state:
-        return whole
     return whole * state[f"{name}.weight"][:, None, None] + state[f"{name}.bias"][:, None, None]
 
 
@@ -118,13 +116,6 @@ def stated_decoder(state: dict[str, Tensor], config: Magvit2Config, codes: Tenso
     for i in range(config.res_blocks):
         x = block(state, f"decoder.mid_block.{i}", x)
     for level in reversed(range(len(config.mult))):
-        if config.adaptive:
-            name = f"decoder.adaptive.{level}"
-            spread = (codes.var(dim=(2, 3), unbiased=True) + 1e-6) ** 0.5
-            gamma = spread @ state[f"{name}.gamma.weight"].T + state[f"{name}.gamma.bias"]
-            mean = codes.mean(dim=(2, 3))
-            beta = mean @ state[f"{name}.beta.weight"].T + state[f"{name}.beta.bias"]
-            x = norm({}, "", x) * gamma[:, :, None, None] + beta[:, :, None, None]
         for i in range(config.res_blocks):
             x = block(state, f"decoder.up.{level}.block.{i}", x)
         if level:
@@ -145,10 +136,9 @@ def depth_to_space(x: Tensor) -> Tensor:
     "config",
     [
         Magvit2Config(base=32, z=18, mult=(1, 1, 2, 2, 4), res_blocks=2),
-        Magvit2Config(base=32, z=18, mult=(1, 2, 1), res_blocks=4, adaptive=True),
         Magvit2Config(base=64, z=13, mult=(1, 1, 3), res_blocks=1),
     ],
-    ids=["released", "adaptive", "odd"],
+    ids=["released", "odd"],
 )
 def test_the_network_is_the_one_written_out(config):
     state = magvit2_state(config)
@@ -164,9 +154,8 @@ def test_the_network_is_the_one_written_out(config):
     assert made.shape == pixels.shape
 
 
-@pytest.mark.parametrize("adaptive", [False, True])
-def test_sizes_are_read_off_the_weights(adaptive):
-    config = Magvit2Config(base=64, z=14, mult=(1, 3, 2), res_blocks=3, adaptive=adaptive)
+def test_sizes_are_read_off_the_weights():
+    config = Magvit2Config(base=64, z=14, mult=(1, 3, 2), res_blocks=3)
     with torch.device("meta"):
         state = dict(Magvit2(config).named_parameters())
     assert derive_config(state) == config
@@ -174,7 +163,7 @@ def test_sizes_are_read_off_the_weights(adaptive):
 
 def test_names_are_those_of_the_release():
     with torch.device("meta"):
-        names = {name for name, _ in Magvit2(Magvit2Config(adaptive=True)).named_parameters()}
+        names = {name for name, _ in Magvit2(Magvit2Config()).named_parameters()}
     assert {
         "encoder.conv_in.weight",
         "encoder.down.3.downsample.bias",
@@ -182,7 +171,6 @@ def test_names_are_those_of_the_release():
         "encoder.mid_block.1.norm2.bias",
         "decoder.up.1.upsample.conv1.weight",
         "decoder.up.3.block.0.nin_shortcut.weight",
-        "decoder.adaptive.4.gamma.weight",
         "decoder.norm_out.weight",
     } <= names
     assert "encoder.conv_in.bias" not in names and "encoder.down.4.downsample.weight" not in names
@@ -277,6 +265,7 @@ def test_halves_are_computed_with_as_floats(tmp_path, weights, tiny):
         ({"encoder.conv_out.weight": None}, r"lacks encoder\.conv_out\.weight"),
         ({"encoder.mid.attn_1.q.weight": torch.zeros(2)}, r"encoder\.mid\.attn_1\.q\.weight"),
         ({"quant_conv.weight": torch.zeros(2)}, r"quant_conv\.weight"),
+        ({"decoder.adaptive.0.gamma.weight": torch.zeros(2)}, r"decoder\.adaptive\.0\.gamma\.weight"),
         ({"decoder.conv_in.weight": torch.zeros(32, 4, 3, 3)}, r"size mismatch for decoder\.conv_in"),
         ({"encoder.conv_in.weight": torch.zeros(24, 3, 3, 3)}, "divisible"),
         ({"encoder.conv_in.weight": torch.zeros(32, 1, 3, 3)}, r"size mismatch for encoder\.conv_in"),
