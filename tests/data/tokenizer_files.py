@@ -10,6 +10,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from hma_data.tokenizers.base import Tokenizer, TokenizerSpec
 from hma_data.tokenizers.magvit2 import Magvit2, Magvit2Config
 
 DRAW = runpy.run_path(str(Path(__file__).parents[2] / "recipes/tokenizer/draw.py"))
@@ -60,6 +61,19 @@ def frames(count: int, seed: int = 0, size: int = 256) -> np.ndarray:
         torch.from_numpy(noise).permute(0, 3, 1, 2).float(), size=(size, size), mode="bilinear"
     )
     return grown.round().to(torch.uint8).permute(0, 2, 3, 1).contiguous().numpy()
+
+
+def assert_contract(tokenizer: Tokenizer, pictures: np.ndarray) -> np.ndarray:
+    """Check shapes and dtypes there and back, also of no pictures; return the decoded ones."""
+    spec = tokenizer.spec
+    assert isinstance(tokenizer, Tokenizer) and TokenizerSpec.from_json(spec.to_json()) == spec
+    tokens = tokenizer.encode(pictures)
+    assert tokens.shape == (len(pictures), *spec.cells) and tokens.dtype == np.dtype(spec.dtype)
+    made = tokenizer.decode(tokens)
+    assert made.shape == pictures.shape and made.dtype == np.uint8
+    assert tokenizer.encode(pictures[:0]).shape == (0, *spec.cells)
+    assert tokenizer.decode(tokens[:0]).shape == (0, *pictures.shape[1:])
+    return made
 
 
 def randomized(network: nn.Module, seed: int = 0) -> nn.Module:

@@ -84,31 +84,6 @@ def test_a_file_that_cannot_be_decoded_is_refused_where_it_is_all_there_is(tmp_p
     for path in (tmp_path, tmp_path / name):
         with pytest.raises(TokenizerError, match=name):
             list(read_films(path, 64))
-
-
-def test_a_video_that_is_left_out_is_told_with_its_fault_once_and_what_may_be_wrong(tmp_path):
-    (tmp_path / "a.mp4").write_bytes(b"junk")
-    skipped: list[str] = []
-    with pytest.raises(TokenizerError):
-        list(read_films(tmp_path, 64, on_skip=skipped.append))
-    (said,) = skipped
-    assert said.count("cannot be decoded") == 1 and said.endswith("copy it again")
-
-
-def test_a_film_without_pictures_is_refused(tmp_path):
-    import av
-
-    with av.open(str(tmp_path / "sound.mp4"), "w") as container:
-        stream = container.add_stream("aac", rate=8000)
-        frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
-        frame.sample_rate = 8000
-        container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-    with pytest.raises(TokenizerError, match="has no video in it"):
-        list(read_films(tmp_path / "sound.mp4", 64))
-
-
-def test_what_is_not_there_is_named(tmp_path):
     with pytest.raises(TokenizerError, match="gone: no such file or folder"):
         list(read_films(tmp_path / "gone", 64))
 

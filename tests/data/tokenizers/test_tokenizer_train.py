@@ -42,30 +42,13 @@ def test_training_makes_weights_that_tokenize(tmp_path):
 
 
 @pytest.mark.slow
-def test_training_learns(tmp_path):
-    out = tmp_path / "w.safetensors"
-    lines: list[str] = []
-    train(write_recipe(tmp_path, steps=60), out, report=lines.append, report_every=30)
-    first, last = (float(line.split("PSNR ")[1].split(" ")[0]) for line in lines[1:])
-    assert last > first
-
-
-@pytest.mark.slow
-def test_training_again_gives_the_same_weights(tmp_path):
+def test_training_again_gives_the_same_weights_also_of_crops_drawn_ahead(tmp_path):
     recipe = write_recipe(tmp_path)
-    facts = [train(recipe, tmp_path / name, report=lambda _: None) for name in ("a", "b")]
-    one, two = load_file(tmp_path / "a"), load_file(tmp_path / "b")
-    assert all(torch.equal(one[name], two[name]) for name in one)
-    assert {**facts[0], "seconds": 0} == {**facts[1], "seconds": 0}
-
-
-@pytest.mark.slow
-def test_crops_drawn_ahead_train_the_same_weights(tmp_path):
-    recipe = write_recipe(tmp_path)
-    for workers in (0, 1, 3):
-        train(recipe, tmp_path / str(workers), workers=workers, report=lambda _: None)
-    alone, one, many = (load_file(tmp_path / name) for name in ("0", "1", "3"))
-    assert all(torch.equal(alone[name], one[name]) and torch.equal(alone[name], many[name]) for name in alone)
+    facts = [
+        train(recipe, tmp_path / str(n), workers=n, report=lambda _: None) | {"seconds": 0} for n in (0, 3)
+    ]
+    alone, ahead = (load_file(tmp_path / name) for name in ("0", "3"))
+    assert all(torch.equal(alone[name], ahead[name]) for name in alone) and facts[0] == facts[1]
 
 
 def test_a_device_that_is_not_there_is_refused_before_anything_is_read(tmp_path):
@@ -231,11 +214,6 @@ def frames() -> np.ndarray:
     return np.stack([draw_scene(rng, 256) for _ in range(9)])
 
 
-def test_its_latents_are_four_channels_at_an_eighth(vae):
-    spec = vae.spec
-    assert (spec.kind, spec.channels, spec.grid, spec.dtype) == ("continuous", 4, (32, 32), "float16")
-
-
 def test_scaled_latents_have_about_unit_variance(vae, frames):
     scaled = vae.encode(frames).astype(np.float64) * vae.spec.latent_scale
     assert 0.6 < scaled.std() < 1.6 and abs(scaled.mean()) < 0.5
@@ -246,12 +224,6 @@ def test_near_latents_decode_to_near_pictures(vae, frames):
     noise = np.random.default_rng(0).normal(0, 0.05, latents.shape)
     plain, moved = vae.decode(latents), vae.decode((latents + noise).astype(np.float16))
     assert psnr_db(plain, moved).mean() > 30
-
-
-@pytest.mark.parametrize("shape", [(1, 4, 16, 16), (1, 3, 32, 32), (4, 32, 32)])
-def test_latents_of_another_shape_are_refused(vae, shape):
-    with pytest.raises(TokenizerError, match="decodes"):
-        vae.decode(np.zeros(shape, np.float16))
 
 
 def test_weights_of_the_discrete_tokenizer_are_refused():
