@@ -6,7 +6,6 @@ tokenizer's spec because it changes the tokens.
 
 import math
 import os
-import re
 import threading
 from functools import cache, lru_cache
 from typing import Any, Literal
@@ -21,7 +20,6 @@ from hma_data.registry.components import Camera, Quality
 
 Filter = Literal["area", "linear", "antialias"]
 _REDUCED = ((8, 64), (4, 32), (2, 16))  # share of a JPEG's sides, and the flag of cv2.IMREAD_REDUCED_*
-TIFF, TIFF_BITS, TIFF_CHANNELS = (b"II*\0", b"MM\0*"), 258, 277  # first bytes; tags
 LEAST_SUM = 2000  # pixels of one call; with fewer, INTER_AREA is as fast as sums
 BATCH = 16  # pictures that `antialias` resizes in one call
 MAX_PIXELS = 64_000_000  # a picture that claims more is a decompression bomb or an error
@@ -64,40 +62,28 @@ def decode_image(data: bytes | NDArray[np.uint8], where: str, least: int = 0) ->
     """
     cv2 = opencv()
     buffer = np.frombuffer(data, np.uint8) if isinstance(data, bytes | bytearray | memoryview) else data
-    if _is_deep(memoryview(buffer)):
-        fault = "an image has more than 8 bits of grey: depth, not colour"
-        raise EpisodeError(where, fault, "name another camera")
+    codec, deep = image_codec(buffer), False
     flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
-    if least and buffer[:2].tobytes() == b"\xff\xd8":
+    if least and codec == "jpeg":
         side = _short_side(memoryview(buffer))
         flags |= next((flag for share, flag in _REDUCED if side >= share * least), 0)
-    fault = ""
+    picture, fault = None, ""
     try:
-        picture = cv2.imdecode(buffer, flags) if len(buffer) else None
+        if codec == "png":  # its header states 16 bits, of grey or of grey and alpha
+            deep = buffer[24:26].tobytes() in (b"\x10\0", b"\x10\4")
+        elif codec is None and len(buffer):  # TIFF, PGM and PFM may be depth; they are rare, so decode twice
+            plain = cv2.imdecode(buffer, cv2.IMREAD_UNCHANGED)
+            deep = plain is not None and plain.ndim == 2 and plain.dtype != np.uint8
+        if len(buffer) and not deep:
+            picture = cv2.imdecode(buffer, flags)
     except cv2.error as error:  # OpenCV checks the claimed size before it decodes
-        picture, fault = None, f": {error.err}"
+        fault = f": {error.err}"
+    if deep:
+        fault = "an image has more than 8 bits of grey: depth, not colour"
+        raise EpisodeError(where, fault, "name another camera")
     if picture is None:
         raise EpisodeError(where, f"an image of {len(buffer)} bytes cannot be decoded{fault}")
     return picture
-
-
-def _is_deep(data: memoryview) -> bool:
-    """Check by its header whether a PNG, TIFF, PGM or PFM has one channel of more than 8 bits."""
-    head = bytes(data[:256])
-    if head[:4] in TIFF:
-        order: Literal["little", "big"] = "little" if head[:1] == b"I" else "big"
-
-        def number(at: int, size: int = 2) -> int:
-            return int.from_bytes(data[at : at + size], order)
-
-        first = number(4, 4)
-        entries = range(first + 2, min(first + 2 + 12 * number(first), len(data)), 12)
-        stated = {number(at): number(at + 8) for at in entries}
-        return stated.get(TIFF_CHANNELS, 1) == 1 and stated.get(TIFF_BITS, 1) > 8
-    if head[:2] in (b"P2", b"P5"):
-        words = re.sub(rb"#.*", b"", head).split(maxsplit=4)  # kind, width, height, largest value
-        return len(words) > 3 and words[3].isdigit() and int(words[3]) > 255
-    return head[:2] == b"Pf" or (head[:8] == b"\x89PNG\r\n\x1a\n" and head[24:26] in (b"\x10\0", b"\x10\4"))
 
 
 def _short_side(jpeg: memoryview) -> int:
