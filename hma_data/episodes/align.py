@@ -12,12 +12,13 @@ Times are float64 seconds. T target times, S source times, A values a sample.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from hma_data.arrays import Bools, Float32s, Floats, Ints
 from hma_data.episodes.episode import Clip, Episode, Known, Signal
-from hma_data.episodes.rotations import between
+from hma_data.episodes.rotations import between, linear
 from hma_data.errors import AlignmentError, EpisodeError
 from hma_data.registry.components import Component
 from hma_data.registry.embodiment import ONE_INDEX, Embodiment
@@ -28,6 +29,16 @@ RATE_TOLERANCE = 0.1  # share of the stated rate by which the measured one may d
 OFF_RATE = "off_rate_frames"  # the flag of an episode whose grid has another rate
 PAUSED, PAUSE = "paused_frames", 3.0  # the flag of frames before a pause; its least length in median steps
 ROUNDING_S = 1e-7  # the error of periods added up over hours; far below any sensor's interval
+
+
+class TimedSignal(NamedTuple):
+    """A signal with its name, its components, and the method and tolerance that move it onto the grid."""
+
+    name: str
+    signal: Signal
+    components: tuple[Component, ...]
+    method: str
+    tolerance_s: float
 
 
 def rounding(*times: Floats) -> float:
@@ -74,8 +85,8 @@ def hold(source_times: Floats, target_times: Floats, tolerance_s: float = 0.0) -
 
 def interpolate(source_times: Floats, values: Float32s, target_times: Floats) -> tuple[Float32s, Floats]:
     """Return values (T, A), linear between neighbours, and skew_ms (T,), the distance to the nearest one."""
-    columns = [np.interp(target_times, source_times, column) for column in values.T.astype(np.float64)]
-    return np.stack(columns, axis=1).astype(np.float32), nearest(source_times, target_times)[1]
+    found = linear(source_times, values.astype(np.float64), target_times)
+    return found.astype(np.float32), nearest(source_times, target_times)[1]
 
 
 def matched(method: str, source_times: Floats, target_times: Floats, tolerance_s: float = 0.0) -> Matches:
@@ -114,7 +125,7 @@ def to_clip(episode: Episode, embodiment: Embodiment) -> Clip:
 def _shared_index(episode: Episode, embodiment: Embodiment) -> Clip:
     """Build the clip of an RLDS, HDF5 or LeRobot episode: frame i, action i and state i belong together."""
     lengths = {name: len(stream.timestamps) for name, stream in episode.streams.items()}
-    lengths |= {name: len(signal.values) for name, signal, _, _ in _signals(episode, embodiment)}
+    lengths |= {one.name: len(one.signal.values) for one in _signals(episode, embodiment)}
     if len({*lengths.values()}) != 1:
         listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
         raise EpisodeError(episode.id, f"its streams differ in length: {listed}")
@@ -147,27 +158,26 @@ def _masked(values: Float32s, marks: Sequence[Known]) -> tuple[Float32s, Known]:
     return np.where(known[:, None], values, np.float32(0)), known
 
 
-def _signals(
-    episode: Episode, embodiment: Embodiment
-) -> list[tuple[str, Signal, tuple[Component, ...], str]]:
-    """Return name, signal, components and method of each signal: first of the actions, then of the states.
+def _signals(episode: Episode, embodiment: Embodiment) -> list[TimedSignal]:
+    """Return all signals: first those of the actions, then those of the states.
 
     The name is the component's key, as in the YAML. Where a camera or an action has that name already, the
     kind (action or state) comes before it. Components of one key share a name.
     """
     sync, taken = embodiment.sync, {*episode.streams}
     states = embodiment.state.components if embodiment.state else ()
-    found: list[tuple[str, Signal, tuple[Component, ...], str]] = []
-    for kind, signals, components, method in (
-        ("action", episode.actions, embodiment.action.components, sync.actions),
-        ("state", episode.states, states, sync.states),
+    found: list[TimedSignal] = []
+    for kind, signals, components, method, tolerance_ms in (
+        ("action", episode.actions, embodiment.action.components, sync.actions, sync.tolerance_ms),
+        ("state", episode.states, states, sync.states, None),
     ):
         apart = len(signals) == len(components)
         for i, signal in enumerate(signals):
             own = components[i : i + 1] if apart else components
             key = own[0].key if apart else kind
-            found.append((f"{kind} {key}" if key in taken else key, signal, own, method))
-        taken |= {name for name, *_ in found}
+            name = f"{kind} {key}" if key in taken else key
+            found.append(TimedSignal(name, signal, own, method, (tolerance_ms or 0) / 1e3))
+        taken |= {one.name for one in found}
     return found
 
 
@@ -178,10 +188,8 @@ def _aligned(episode: Episode, embodiment: Embodiment) -> Clip:
     """Build the clip of a bag: move every stream onto the grid by the method that the embodiment names."""
     sync, primary = embodiment.sync, embodiment.primary_camera.name
     signals = _signals(episode, embodiment)
-    tolerances = [(sync.tolerance_ms or 0) / 1e3] * len(episode.actions) + [0.0] * len(episode.states)
     timed: list[Timed] = [(name, one.timestamps, sync.images, 0.0) for name, one in episode.streams.items()]
-    for (name, signal, _, method), tolerance_s in zip(signals, tolerances, strict=True):
-        timed.append((name, signal.timestamps, method, tolerance_s))
+    timed += [(one.name, one.signal.timestamps, one.method, one.tolerance_s) for one in signals]
     for name, times, *_ in timed:
         _check_times(episode.id, name, times, _clock_remedy(embodiment))
     frames = np.unique(episode.streams[primary].timestamps)  # equal stamps give one frame of the grid
@@ -199,9 +207,9 @@ def _aligned(episode: Episode, embodiment: Embodiment) -> Clip:
     # A frame exactly at the limit stays in, whatever its stamp's last digit.
     limit = sync.max_skew_ms and sync.max_skew_ms + 1e3 * rounding(grid, frames)
     moved, marks = [], []
-    for (name, signal, components, method), tolerance_s in zip(signals, tolerances, strict=True):
-        values, known, off = _moved(signal, components, method, grid, tolerance_s)
-        skew[name] = np.maximum(skew.get(name, off), off)  # components of one key share a name
+    for one in signals:
+        values, known, off = _moved(one, grid)
+        skew[one.name] = np.maximum(skew.get(one.name, off), off)  # components of one key share a name
         if limit and sync.beyond == "mask":
             near = off <= limit
             known = near if known is None else known & near
@@ -228,16 +236,15 @@ def _aligned(episode: Episode, embodiment: Embodiment) -> Clip:
     )  # fmt: skip
 
 
-def _moved(
-    signal: Signal, components: tuple[Component, ...], method: str, grid: Floats, tolerance_s: float
-) -> tuple[Float32s, Known, Floats]:
+def _moved(one: TimedSignal, grid: Floats) -> tuple[Float32s, Known, Floats]:
     """Return the values (T, A) of a signal on the grid, which of them are known (T,), and skew_ms (T,)."""
-    if method != "interpolate":
-        index, skew = matched(method, signal.timestamps, grid, tolerance_s)
+    signal = one.signal
+    if one.method != "interpolate":
+        index, skew = matched(one.method, signal.timestamps, grid, one.tolerance_s)
         return signal.values[index], None if signal.known is None else signal.known[index], skew
     values, skew = interpolate(signal.timestamps, signal.values, grid)
     start = 0
-    for component in components:
+    for component in one.components:
         span = slice(start, start := start + component.dims)
         if component.representation:
             values[:, span] = between(

@@ -37,10 +37,10 @@ def between(
     width = _WIDTHS[representation]
     place = 3 if values.shape[1] == width + 3 and representation != "rotation_matrix" else 0
     rows = values.astype(np.float64)
-    found = _linear(source_times, rows, target_times)
+    found = linear(source_times, rows, target_times)
     if values.shape[1] - place == width:
         period = 360.0 if (unit or "").strip().lower() in _DEGREES else 2 * np.pi
-        turned, linear = rows[:, place:], found[:, place:]
+        turned = rows[:, place:]
         if representation == "euler_xyz":
             found[:, place:] = _angles(source_times, turned, target_times, period)
         elif representation == "axis_angle":
@@ -48,11 +48,12 @@ def between(
         elif width == 4:
             found[:, place:] = _quaternions(source_times, turned, target_times)
         elif representation == "rotation_matrix":
-            found = _nearest_rotation(linear)
+            found = _nearest_rotation(found)
     return found.astype(np.float32)
 
 
-def _linear(source_times: Floats, values: Floats, target_times: Floats) -> Floats:
+def linear(source_times: Floats, values: Floats, target_times: Floats) -> Floats:
+    """Return values (T, A) between samples (S, A), number by number."""
     return np.stack([np.interp(target_times, source_times, column) for column in values.T], axis=1)
 
 
@@ -69,7 +70,7 @@ def _quaternions(source_times: Floats, values: Floats, target_times: Floats) -> 
     before = np.clip(np.searchsorted(source_times, target_times, side="right") - 1, 0, last)
     after = np.minimum(before + 1, last)
     share = (
-        _linear(source_times, np.arange(len(values), dtype=np.float64)[:, None], target_times)[:, 0] - before
+        linear(source_times, np.arange(len(values), dtype=np.float64)[:, None], target_times)[:, 0] - before
     )
     units = _directions(steady)
     arc = np.arccos(np.clip((units[before] * units[after]).sum(axis=1), -1, 1))
@@ -90,7 +91,7 @@ def _angles(source_times: Floats, values: Floats, target_times: Floats, period: 
     steady: Floats = np.unwrap(values, period=period, axis=0).astype(np.float64)
     at = _index_of_nearest(source_times, target_times)
     # Unwrapping has added whole turns; those of the nearest sample are taken off again.
-    found = _linear(source_times, steady, target_times) - (steady - values)[at]
+    found = linear(source_times, steady, target_times) - (steady - values)[at]
     lowest, highest = values.min(axis=0), values.max(axis=0)
     slack = 1e-3 * period
     for column in range(values.shape[1]):
