@@ -5,9 +5,9 @@ and `hma_data.episodes.images.picture_flags`). How well the tokens keep what mov
 """
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
 
 from hma_data.episodes.align import OFF_RATE, PAUSE, PAUSED, measured_hz, pause_remedy, rate_remedy
@@ -32,12 +32,11 @@ def rate_finding(shards: ShardSet) -> Finding | None:
 
     It is an error where more than half of the episodes are flagged, because the stride is then wrong.
     """
-    episodes = shards.episodes
-    flagged = episodes.filter(pc.match_substring(episodes["flags"], f"{OFF_RATE}="))
+    flagged = _flagged(shards, OFF_RATE)
     if not len(flagged):
         return None
-    robot, count, total = shards.embodiment, len(flagged), len(episodes)
-    which, hz = next(_measured(shards, flagged[:MAX_MEASURED].to_pylist()), ("", None))
+    robot, count, total = shards.embodiment, len(flagged), len(shards.episodes)
+    which, hz = _measured(shards, flagged)
     said = f"{count:,} of {total:,} episodes have another rate than the stated {robot.rate_hz:g} Hz"
     said += f", such as {which} with {hz:.3g} Hz" if hz else ""
     remedy = f"{rate_remedy(robot)}, and convert again with --overwrite"
@@ -52,16 +51,15 @@ def pause_finding(shards: ShardSet) -> Finding | None:
     """
     from hma_data.shards.windows import WINDOW, WindowIndex
 
-    episodes = shards.episodes
-    flagged = episodes.filter(pc.match_substring(episodes["flags"], f"{PAUSED}="))
+    flagged, total = _flagged(shards, PAUSED), len(shards.episodes)
     if not len(flagged):
         return None
     count, which = len(flagged), flagged["id"][0].as_py()
     whole = int(np.maximum(0, shards.index("train").length - WINDOW * shards.row_stride + 1).sum())
     lost = whole - WindowIndex.of(shards, "train", WINDOW).count
-    said = f"{count:,} of {len(episodes):,} episodes have a pause of {PAUSE:g} steps or more, such as {which}"
+    said = f"{count:,} of {total:,} episodes have a pause of {PAUSE:g} steps or more, such as {which}"
     said += f"; {lost:,} of {whole:,} training windows would cross one and are left out" if lost else ""
-    hz = next((hz for _, hz in _measured(shards, flagged[:MAX_MEASURED].to_pylist())), None)
+    _, hz = _measured(shards, flagged)
     severity: Severity = "warn" if lost > MAX_LOST_SHARE * whole else "info"
     numbers = {"episodes": count, "windows": lost}
     return Finding("gaps", severity, said, pause_remedy(shards.embodiment, hz), numbers=numbers)
@@ -87,25 +85,31 @@ def window_finding(shards: ShardSet) -> Finding | None:
 
 def picture_findings(shards: ShardSet) -> Iterator[Finding]:
     """Yield a finding for each camera that shows one colour, or one image, throughout some episodes."""
-    episodes = shards.episodes
+    total = len(shards.episodes)
     for camera in shards.manifest.cameras:
         for check, shown in (("blank", "one colour"), ("still", "one image")):
-            flagged = episodes.filter(pc.match_substring(episodes["flags"], f"{check}_pictures:{camera}="))
-            if not len(flagged):
-                continue
-            ids = flagged["id"].to_pylist()
-            said = f"camera {camera} shows {shown} throughout in {len(ids):,} of {len(episodes):,} episodes"
-            remedy = "look at them with hma shards preview --only ID; hma convert --exclude leaves them out"
-            yield Finding(check, "warn", f"{said}: {listed(ids)}", remedy, camera, {"episodes": ids})
+            ids = _flagged(shards, f"{check}_pictures:{camera}")["id"].to_pylist()
+            if ids:
+                said = f"camera {camera} shows {shown} throughout in {len(ids):,} of {total:,} episodes"
+                remedy = (
+                    "look at them with hma shards preview --only ID; hma convert --exclude leaves them out"
+                )
+                yield Finding(check, "warn", f"{said}: {listed(ids)}", remedy, camera, {"episodes": ids})
 
 
-def _measured(shards: ShardSet, rows: list[dict[str, Any]]) -> Iterator[tuple[str, float]]:
-    """Yield the id and the rate in Hz of each episode that has more than one row."""
+def _flagged(shards: ShardSet, flag: str) -> pa.Table:
+    """Return the episodes of the set that have a flag."""
+    return shards.episodes.filter(pc.match_substring(shards.episodes["flags"], f"{flag}="))
+
+
+def _measured(shards: ShardSet, episodes: pa.Table) -> tuple[str, float | None]:
+    """Return the id and the rate in Hz of the first episode that has more than one row."""
     reader = EpisodeReader(shards, ["timestamp"])
-    for row in rows:
+    for row in episodes[:MAX_MEASURED].to_pylist():
         times = reader.rows(row["shard"], row["row_start"], row["length"])["timestamp"]
         if hz := measured_hz(np.diff(times)):
-            yield row["id"], hz * shards.manifest.frame_stride
+            return row["id"], hz * shards.manifest.frame_stride
+    return "", None
 
 
 # -- how well the tokens keep what moves
