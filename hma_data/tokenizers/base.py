@@ -184,9 +184,7 @@ def _of_package(entry: Entry, keywords: dict[str, Any]) -> Tokenizer:
     """Return the tokenizer that an installed package adds; raise PluginError if the package is broken."""
     plugin = installed(TOKENIZER_GROUP)[entry.name]
     module = plugin.call(f"importing {entry.module}", import_module, entry.module)
-    if not callable(getattr(module, "load", None)):
-        raise plugin.broken(f"{entry.module} has no load()")
-    tokenizer = plugin.call("load()", module.load, entry.name, **keywords)
+    tokenizer = plugin.call("load()", lambda: module.load(entry.name, **keywords))
     if not isinstance(tokenizer, Tokenizer) or not isinstance(tokenizer.spec, TokenizerSpec):
         kind = type(tokenizer).__name__
         raise plugin.broken(f"load() returns {kind}, not a hma_data.tokenizers.base.Tokenizer")
