@@ -39,16 +39,17 @@ def test_training_makes_weights_that_tokenize(tmp_path):
     assert facts["steps"] == 6 and len(lines) == 3
     tokenizer = get_tokenizer("fsq-8", weights=str(out))
     assert psnr_db(scenes(4, 128), tokenizer.decode(tokenizer.encode(scenes(4, 128)))).mean() > 14
+    assert float(torch.tensor(1e-40) * 1.0) > 0  # denormal numbers are as they were
 
 
 @pytest.mark.slow
 def test_training_again_gives_the_same_weights_also_of_crops_drawn_ahead(tmp_path):
-    recipe = write_recipe(tmp_path)
-    facts = [
-        train(recipe, tmp_path / str(n), workers=n, report=lambda _: None) | {"seconds": 0} for n in (0, 3)
-    ]
+    recipe, facts = write_recipe(tmp_path), {}
+    for workers in (0, 3):
+        facts[workers] = train(recipe, tmp_path / str(workers), workers=workers, report=lambda _: None)
     alone, ahead = (load_file(tmp_path / name) for name in ("0", "3"))
-    assert all(torch.equal(alone[name], ahead[name]) for name in alone) and facts[0] == facts[1]
+    assert all(torch.equal(alone[name], ahead[name]) for name in alone)
+    assert facts[0] | {"seconds": 0} == facts[3] | {"seconds": 0}
 
 
 def test_a_device_that_is_not_there_is_refused_before_anything_is_read(tmp_path):
@@ -189,11 +190,6 @@ def test_weight_decay_bounds_the_norm_of_a_matrix_that_is_always_pushed_one_way(
             optimizer.step()
         norms[decay] = float(torch.linalg.matrix_norm(weight.detach(), 2))
     assert norms[0.0] > 10 and norms[0.5] < 1.3 / 0.5
-
-
-def test_training_leaves_denormal_numbers_as_they_were(tmp_path):
-    train(write_recipe(tmp_path), tmp_path / "w", report=lambda _: None)
-    assert float(torch.tensor(1e-40) * 1.0) > 0
 
 
 # -- continuous latents
