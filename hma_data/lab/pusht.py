@@ -140,20 +140,16 @@ class PushArena:
         self.success = self.success or coverage > SUCCESS
 
 
-def _policy(arena: PushArena, rng: np.random.Generator, start: str, fly: bool) -> Planned | Wandering:
-    if start == "random":
-        return Wandering(arena.agent, fly, rng)
-    return Planned(arena.tee, arena.goal, arena.agent, SPEED, fly, rng)
-
-
 def _within(target: Floats) -> Floats:
     return np.clip(target, 15.0, 497.0)
 
 
 class _Pusher:
-    """What both robots have: an arena, which the camera shows whole."""
+    """What both robots have: an arena, which the camera shows whole, and the generator of their driver."""
 
-    arena: PushArena
+    def __init__(self, look: FrameLook, seed: tuple[int, ...], start: str) -> None:
+        self.rng, self.start = np.random.default_rng(seed), start
+        self.arena = PushArena(look, start, self.rng)
 
     @property
     def own(self) -> Floats:
@@ -168,6 +164,12 @@ class _Pusher:
     def picture(self) -> Images:
         """Render the arena; (size, size, 3) RGB."""
         return self.arena.picture()
+
+    def _policy(self, fly: bool) -> Planned | Wandering:
+        arena = self.arena
+        if self.start == "random":
+            return Wandering(arena.agent, fly, self.rng)
+        return Planned(arena.tee, arena.goal, arena.agent, SPEED, fly, self.rng)
 
 
 def begin(robot: str, seed: int, episode: int) -> "tuple[FastPusher | SlowPusher, Callable[[], Float32s]]":
@@ -196,9 +198,7 @@ class FastPusher(_Pusher):
     def __init__(
         self, seed: int, episode: int, look: FrameLook = FAST_LOOK, starts: tuple[str, ...] = STARTS
     ) -> None:
-        self.rng = np.random.default_rng((seed, 0, episode))
-        self.start = starts[episode % len(starts)]
-        self.arena = PushArena(look, self.start, self.rng)
+        super().__init__(look, (seed, 0, episode), starts[episode % len(starts)])
 
     @property
     def observed(self) -> Float32s:
@@ -212,7 +212,7 @@ class FastPusher(_Pusher):
     def driver(self) -> Callable[[], Float32s]:
         """Return the recorder's driver of the episode, which returns the next action (2,)."""
         arena = self.arena
-        targets = Targets(_policy(arena, self.rng, self.start, fly=False), arena.agent)
+        targets = Targets(self._policy(fly=False), arena.agent)
         return lambda: targets.held if arena.success else targets.next(arena.pose, arena.agent)
 
 
@@ -299,9 +299,7 @@ class SlowPusher(_Pusher):
     """pusht_slow: an arena whose actions are the velocity of the pusher's setpoint, and whether it is up."""
 
     def __init__(self, seed: int, episode: int) -> None:
-        self.rng = np.random.default_rng((seed, 1, episode))
-        self.start = STARTS[episode % len(STARTS)]
-        self.arena = PushArena(SLOW_LOOK, self.start, self.rng)
+        super().__init__(SLOW_LOOK, (seed, 1, episode), STARTS[episode % len(STARTS)])
         self.setpoint = self.arena.agent
         self.velocity: Floats = np.zeros(2)
 
@@ -327,7 +325,7 @@ class SlowPusher(_Pusher):
 
     def commander(self) -> Callable[[], Floats]:
         """Return the recorder's driver of the episode; it returns (3,) an action for COMMAND_TICKS."""
-        arena, policy = self.arena, _policy(self.arena, self.rng, self.start, fly=True)
+        arena, policy = self.arena, self._policy(fly=True)
         period = COMMAND_TICKS * TICK_S
 
         def action() -> Floats:
@@ -382,5 +380,5 @@ def _slow_bag(path: Path, seed: int, episode: int) -> None:
             given = action()
             robot.take(given)
             bag.command(at, given)
-    facts = {"success": str(arena.success).lower(), "start": STARTS[episode % len(STARTS)], "seed": str(seed)}
+    facts = {"success": str(arena.success).lower(), "start": robot.start, "seed": str(seed)}
     write_mcap(path, bag.messages, {"robot": "pusht_slow", **facts})

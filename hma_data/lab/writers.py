@@ -22,7 +22,6 @@ from hma_data.sources.rlds.records import masked_crc
 
 DISTRO = "jazzy"  # of ROS
 EPOCH_NS = 1_700_000_000_000_000_000  # start of the first bag's stamps
-_CORE = "tensorflow_datasets.core.features"
 
 # -- HDF5
 
@@ -178,38 +177,40 @@ def write_rlds(
 def _features(
     sizes: Mapping[str, tuple[int, int]], codec: str, widths: Mapping[str, int], facts: Mapping[str, Any]
 ) -> dict[str, Any]:
-    words = {"pythonClassName": f"{_CORE}.text_feature.Text", "text": {}}
+    words = _feature("text_feature.Text", "text")
     leaves: dict[str, Any] = {"language_instruction": words}
     for key, (height, width) in sizes.items():
         shape = {"dimensions": [str(height), str(width), "3"]}
-        image = {"shape": shape, "dtype": "uint8", "encodingFormat": codec}
-        leaves[key] = {"pythonClassName": f"{_CORE}.image_feature.Image", "image": image}
+        leaves[key] = _feature(
+            "image_feature.Image", "image", shape=shape, dtype="uint8", encodingFormat=codec
+        )
     for key, width in widths.items():
-        tensor = {"shape": {"dimensions": [str(width)]}, "dtype": "float32", "encoding": "none"}
-        leaves[key] = {"pythonClassName": f"{_CORE}.tensor_feature.Tensor", "tensor": tensor}
+        shape = {"dimensions": [str(width)]}
+        leaves[key] = _feature(
+            "tensor_feature.Tensor", "tensor", shape=shape, dtype="float32", encoding="none"
+        )
     nested: dict[str, Any] = {}
     for path, leaf in leaves.items():
         *parents, last = path.split("/")
         reduce(lambda at, parent: at.setdefault(parent, {}), parents, nested)[last] = leaf
-    steps = {"feature": _dict(nested), "length": "-1"}
-    sequence = {"pythonClassName": f"{_CORE}.dataset_feature.Dataset", "sequence": steps}
-    episode: dict[str, Any] = {"steps": sequence}
+    steps = _feature("dataset_feature.Dataset", "sequence", feature=_dict(nested), length="-1")
+    episode: dict[str, Any] = {"steps": steps}
     if facts:
-        episode["episode_metadata"] = {
-            key: words if isinstance(value, str) else _scalar(value) for key, value in facts.items()
-        }
+        episode["episode_metadata"] = {}
+    for key, value in facts.items():
+        dtype = "bool" if isinstance(value, bool) else "int64"
+        number = _feature("scalar.Scalar", "tensor", shape={}, dtype=dtype, encoding="none")
+        episode["episode_metadata"][key] = words if isinstance(value, str) else number
     return _dict(episode)
 
 
-def _scalar(value: bool | int) -> dict[str, Any]:
-    dtype = "bool" if isinstance(value, bool) else "int64"
-    tensor = {"shape": {}, "dtype": dtype, "encoding": "none"}
-    return {"pythonClassName": f"{_CORE}.scalar.Scalar", "tensor": tensor}
+def _feature(kind: str, field_name: str, **values: Any) -> dict[str, Any]:
+    return {"pythonClassName": f"tensorflow_datasets.core.features.{kind}", field_name: values}
 
 
 def _dict(items: dict[str, Any]) -> dict[str, Any]:
     known = {key: value if "pythonClassName" in value else _dict(value) for key, value in items.items()}
-    return {"pythonClassName": f"{_CORE}.features_dict.FeaturesDict", "featuresDict": {"features": known}}
+    return _feature("features_dict.FeaturesDict", "featuresDict", features=known)
 
 
 def _example(episode: RldsEpisode) -> bytes:
