@@ -3,11 +3,9 @@
 import json
 import sys
 from collections.abc import Iterator
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import cv2
 import h5py
 import numpy as np
 import pytest
@@ -21,7 +19,7 @@ from hma_data.lab.pusher import LENGTHS, predicted_costs, rotation
 from hma_data.lab.pusht import SLOW_LOOK, STEPS_HELD, PushArena
 from hma_data.lab.tee_table import TeeTable
 from hma_data.lab.writers import _held_out
-from hma_data.registry.embodiment import Embodiment, find
+from hma_data.registry.embodiment import find
 from hma_data.sources.base import open_source
 from hma_data.storage.paths import shipped
 from tests.conftest import contents
@@ -147,15 +145,6 @@ def test_the_table_is_that_of_gym_pusht() -> None:
         assert touched
 
 
-def test_pictures_show_the_state_they_are_recorded_with(fast: h5py.File) -> None:
-    demo = fast["data/demo_1"]
-    for t in (0, 20, 40, 60):
-        red, _, blue = np.moveaxis(demo["obs/image"][t].astype(int), -1, 0)
-        rows, columns = np.nonzero((blue > 200) & (red < 120))
-        seen = np.array([columns.mean(), rows.mean()]) * 512 / 128
-        assert np.linalg.norm(seen - demo["obs/agent_pos"][t]) < 6
-
-
 @pytest.mark.slow
 def test_any_mcap_reader_decodes_the_bags_by_their_own_schemas(slow: list[Path]) -> None:
     topics = bag(slow[0])
@@ -178,34 +167,6 @@ def test_topics_tick_at_their_own_rates_with_jitter(slow: list[Path]) -> None:
         assert (len(stamps) - 1) / (stamps[-1] - stamps[0]) == pytest.approx(hz, rel=0.01)
         assert (np.std(np.diff(stamps)) > 1e-3) == (topic != "/joint_states")
         assert all(stamp < received for stamp, received, _ in topics[topic])
-
-
-@pytest.mark.slow
-def test_camera_shows_the_joint_states(slow: list[Path]) -> None:
-    topics = bag(slow[1])
-    stamps = np.array([stamp for stamp, _, _ in topics["/joint_states"]], dtype=np.float64)
-    places = np.stack([message.position for _, _, message in topics["/joint_states"]])
-    errors = []
-    for stamp, _, message in topics["/camera/image/compressed"]:
-        blue, green, red = np.moveaxis(cv2.imdecode(message.data, cv2.IMREAD_COLOR).astype(int), -1, 0)
-        rows, columns = np.nonzero(((red > 190) & (green < 80)) | ((blue > 200) & (red < 90)))
-        if len(rows) > 8:
-            true = [np.interp(stamp, stamps, places[:, axis]) for axis in (0, 1)]
-            errors.append(np.hypot(columns.mean() * 512 / 96 - true[0], rows.mean() * 512 / 96 - true[1]))
-    assert len(errors) > 50 and np.median(errors) < 6
-
-
-@pytest.mark.slow
-def test_pusher_moves_as_commanded(slow: list[Path]) -> None:
-    topics = bag(slow[1])
-    stamps = np.array([stamp for stamp, _, _ in topics["/joint_states"]], dtype=np.float64)
-    places = np.stack([message.position for _, _, message in topics["/joint_states"]])
-    commanded, moved = [], []
-    for (start, _, message), (stop, _, _) in pairwise(topics["/command"]):
-        commanded += [message.twist.linear.x, message.twist.linear.y]
-        delay = 5e7  # the setpoint leads the spring
-        moved += [np.diff(np.interp([start + delay, stop + delay], stamps, places[:, a]))[0] for a in (0, 1)]
-    assert np.corrcoef(commanded, moved)[0, 1] > 0.9
 
 
 def test_raised_pusher_passes_over_the_tee_and_lowered_one_pushes_it() -> None:
@@ -253,29 +214,8 @@ def test_planner_predicts_what_the_physics_do(contact: int) -> None:
 @pytest.mark.parametrize("robot", RECORDERS)
 def test_same_seed_gives_same_bytes(tmp_path: Path, robot: str) -> None:
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
-        record(robot, tmp_path / name, 2, seed)
+        record(robot, tmp_path / name, 1, seed)
     assert contents(tmp_path / "a") == contents(tmp_path / "b") != contents(tmp_path / "c")
-
-
-@pytest.mark.parametrize("robot", ["pusht_fast", "pusht_slow"])
-def test_registry_describes_the_robot(robot: str, fast: h5py.File, slow: list[Path]) -> None:
-    embodiment = Embodiment.load(shipped("registry") / "lab" / f"{robot}.yaml")
-    assert embodiment.id == robot and embodiment.normalize_mask.sum() == 2
-    if robot == "pusht_fast":
-        lengths = [fast[f"data/{demo}"].attrs["num_samples"] for demo in fast["data"]]
-        keys = [part.key for part in embodiment.action.components]
-        assert [fast["data/demo_0"][key].shape[1] for key in keys] == [embodiment.action_dim]
-        assert fast["data/demo_0"][embodiment.cameras[0].key].ndim == 4
-    else:
-        topics = [bag(path) for path in slow]
-        lengths = [len(found[embodiment.cameras[0].key]) - 2 for found in topics]  # ends may be trimmed
-        for part in embodiment.action.components:
-            topic, *fields = part.key.split(".")
-            value: Any = topics[0][topic][0][2]
-            for field in fields:
-                value = getattr(value, field)
-            assert isinstance(value, float) and part.dims == 1
-    assert min(lengths) >= 8 * embodiment.stride
 
 
 def test_progress_counts_episodes(tmp_path: Path) -> None:

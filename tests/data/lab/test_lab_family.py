@@ -16,7 +16,6 @@ from hma_data.errors import UsageError
 from hma_data.lab import RECORDERS, record
 from hma_data.lab.family import HELD_OUT, TRUNK, embodiment, episode
 from hma_data.lab.family.bodies import Body
-from hma_data.lab.family.driver import CHANCES, PUSHING
 from hma_data.lab.family.look import SIZE
 from hma_data.lab.family.mechanisms import MAKERS
 from hma_data.lab.family.table import BlockTable, start
@@ -28,25 +27,11 @@ from hma_data.sources.base import open_source
 from hma_data.storage.paths import shipped
 from tests.conftest import BlockTokenizer
 
-ROBOTS = (
-    "arm1_02",
-    "arm2_12",
-    "arm3_55",
-    "arm4_04",
-    "mover_10",
-    "mover_52",
-    "gantry_04",
-    "rails_09",
-    "crane_01",
-)
 SEED = 3
 
 
 def quick(robots: Iterable[str], *few: str) -> list[Any]:
     return [one if one in few else pytest.param(one, marks=pytest.mark.slow) for one in robots]
-
-
-EVERY = quick(ROBOTS, "arm2_12", "mover_52", "crane_01")
 
 
 def still(world: BlockTable) -> np.ndarray[Any, Any]:
@@ -71,17 +56,7 @@ def test_trunk_has_all_kinds_and_no_robot_that_is_held_out() -> None:
     assert all(5 <= rate <= 10 and rate == int(rate) for rate in rates)
 
 
-@pytest.mark.parametrize("robot", EVERY)
-def test_same_seed_gives_the_same_episode(robot: str) -> None:
-    body = Body.of(robot)
-    first, again, other = (episode(body, SEED, number) for number in (0, 0, 1))
-    for key in ("image", "joint_pos"):
-        assert first.observations[key].tobytes() == again.observations[key].tobytes()
-    assert first.actions.tobytes() == again.actions.tobytes() != other.actions.tobytes()
-    assert first.observations["image"].shape == (8 * body.hz, SIZE, SIZE, 3)
-
-
-@pytest.mark.parametrize("robot", EVERY)
+@pytest.mark.parametrize("robot", ["arm2_12", "mover_52", "gantry_04", "rails_09", "crane_01"])
 def test_other_commands_make_other_pictures_and_no_command_a_still_one(robot: str) -> None:
     steps = 6 * Body.of(robot).stride
     low, high, rest = (driven(robot, command, steps)[1] for command in ("low", "high", "still"))
@@ -92,20 +67,15 @@ def test_other_commands_make_other_pictures_and_no_command_a_still_one(robot: st
 
 
 @pytest.mark.parametrize("robot", quick([*TRUNK, *HELD_OUT], "arm3_08", "rails_03", "mover_52"))
-def test_commands_fill_the_range_of_the_embodiment(robot: str) -> None:
+def test_commands_fill_their_range_and_blocks_stay_inside_and_out_of_the_parts_that_push(robot: str) -> None:
     body, parts = Body.of(robot), embodiment(robot).action.components
-    actions = episode(body, SEED, 0).actions
-    assert actions.shape[1] == len(parts) == embodiment(robot).action_dim
-    for values, part in zip(actions.T, parts, strict=True):
+    recorded = episode(body, SEED, 0)
+    assert recorded.actions.shape[1] == len(parts) == embodiment(robot).action_dim
+    for values, part in zip(recorded.actions.T, parts, strict=True):
         low, high = part.range or (0, 0)
         assert low - 1e-5 <= values.min() and values.max() <= high + 1e-5
         assert np.ptp(values) > 0.25 * (high - low)
-
-
-@pytest.mark.parametrize("robot", quick([*TRUNK, *HELD_OUT], "arm3_08", "rails_03", "mover_52"))
-def test_blocks_stay_inside_and_out_of_the_parts_that_push(robot: str) -> None:
-    body = Body.of(robot)
-    states = episode(body, SEED, 0).states[:: body.stride]
+    states = recorded.states[:: body.stride]
     radii = np.array([block.radius for block in body.blocks])[:, None]
     for state in states:
         pose, blocks, held = (
@@ -121,22 +91,6 @@ def test_blocks_stay_inside_and_out_of_the_parts_that_push(robot: str) -> None:
                     share = np.linspace(0, 1, 200)[:, None]
                     line = part.points[0] + share * (part.points[1] - part.points[0])
                     assert np.linalg.norm(line - place, axis=1).min() > part.radius + radii[number] - 0.5
-
-
-@pytest.mark.slow
-def test_most_robots_push_a_block_in_some_of_their_episodes() -> None:
-    pushed = [any(episode(Body.of(robot), SEED, number).success for number in range(3)) for robot in TRUNK]
-    assert sum(pushed) >= 20
-
-
-@pytest.mark.slow
-def test_pushing_moves_blocks_further() -> None:
-    body = Body.of("mover_10")
-    moved = [
-        sum(episode(body, SEED, number, chances=chances).rewards.sum() for number in range(8))
-        for chances in (CHANCES, PUSHING)
-    ]
-    assert moved[1] > 1.3 * moved[0]
 
 
 @pytest.mark.parametrize(("robot", "hold", "release"), [("arm2_07", 0.0, 1.0), ("crane_01", 1.0, 0.0)])
@@ -165,7 +119,7 @@ def test_registry_has_what_the_family_says(robot: str) -> None:
     assert robot in RECORDERS
 
 
-@pytest.mark.parametrize("robot", quick(["arm2_07", *HELD_OUT], "arm3_55"))
+@pytest.mark.parametrize("robot", quick(HELD_OUT, "arm3_55"))
 def test_recording_converts(robot: str, block_tokenizer: BlockTokenizer, tmp_path: Path) -> None:
     own, demos = embodiment(robot), [episode(Body.of(robot), SEED, number) for number in range(2)]
     path = record(robot, tmp_path, 2, SEED)

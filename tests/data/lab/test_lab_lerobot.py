@@ -6,15 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hma_data.conversion.job import convert
 from hma_data.episodes.episode import Episode
 from hma_data.lab import record
 from hma_data.lab.planar_arm import STEPS
 from hma_data.registry.embodiment import find
-from hma_data.shards.reader import ShardSet
-from hma_data.shards.verify import verify
 from hma_data.sources.base import open_source
-from hma_data.sources.detect import detect
 
 pytestmark = pytest.mark.slow  # of the import of lerobot, and of encoding AV1
 EPISODES, SEED = 2, 3
@@ -54,14 +50,3 @@ def test_the_episodes_are_those_of_the_recording_in_hdf5(recorded: Path, tmp_pat
             episode.streams["top"].frames(range(0, STEPS, 5)).astype(float) for episode in (ours, original)
         )
         assert 10 * np.log10(255**2 / np.square(shown - drawn).mean()) > 30  # the video is lossy
-
-
-def test_it_is_found_to_be_lerobots_and_converts(recorded, block_tokenizer, tmp_path) -> None:
-    robot = find("planar_arm_lerobot")
-    assert detect(str(recorded)) == robot.source.format == "lerobot"
-    convert(robot, str(recorded), block_tokenizer, tmp_path / "shards")
-    assert verify(tmp_path / "shards") == []
-    shards = ShardSet(tmp_path / "shards")
-    kept = [shards.episode_rows(index)["action"] for index in range(EPISODES)]
-    for values, episode in zip(kept, episodes_of("planar_arm_lerobot", recorded), strict=True):
-        np.testing.assert_array_equal(values, episode.actions[0].values)

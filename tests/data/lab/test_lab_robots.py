@@ -21,7 +21,6 @@ from hma_data.sources.base import open_source
 
 EPISODES, SEED = 3, 3
 ROBOTS = ("pendulum", "planar_arm")
-RECORDERS = {"pendulum": pendulum, "planar_arm": planar_arm}
 
 
 @dataclass(frozen=True)
@@ -53,15 +52,6 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Recorded]:
     return made
 
 
-def replayed(robot: str, episode: int, actions: NDArray[np.float32]) -> NDArray[np.uint8]:
-    world: Any = RECORDERS[robot].start(SEED, episode)[0]
-    pictures = []
-    for action in actions:
-        pictures.append(world.picture())
-        world.advance(action)
-    return np.stack(pictures)
-
-
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_recording_reads_as_the_registry_describes(robot: str, recordings: dict[str, Recorded]) -> None:
     recorded = recordings[robot]
@@ -85,16 +75,6 @@ def test_recording_converts(robot, stride, recordings, block_tokenizer, tmp_path
     rows = [shards.episode_rows(row["episode_index"]) for row in shards.episodes.to_pylist()]
     kept = sorted(values["action"].tobytes() for values in rows)
     assert kept == sorted(recorded.actions(i).tobytes() for i in range(EPISODES))
-
-
-@pytest.mark.parametrize("robot", ROBOTS)
-def test_other_actions_make_other_pictures(robot: str, recordings: dict[str, Recorded]) -> None:
-    actions = recordings[robot].actions(1)
-    seen, other = recordings[robot].pictures(1), replayed(robot, 1, -actions)
-    first = int(np.flatnonzero(np.abs(actions).max(axis=1) > 0.2)[0])
-    np.testing.assert_array_equal(other[0], seen[0])
-    moved = np.abs(other[first + 5 :].astype(int) - seen[first + 5 :]).max(axis=-1) > 60
-    assert np.median(moved.sum(axis=(1, 2))) > 200
 
 
 @pytest.mark.parametrize(
@@ -136,20 +116,6 @@ def test_pictures_show_the_rod_at_its_recorded_angle(recordings: dict[str, Recor
     assert max(errors) < 0.1
 
 
-def test_swing_up_brings_the_rod_to_rest_upright() -> None:
-    stood = []
-    for seed in range(12):
-        world, rng = pendulum.start(seed, 0)
-        drive = pendulum.DRIVERS[0][1](rng)
-        angles = []
-        for _ in range(pendulum.STEPS):
-            torque = np.clip(drive(world.angle, world.speed), -pendulum.TORQUE, pendulum.TORQUE)
-            world.advance(np.array([torque], dtype=np.float32))
-            angles.append(abs(world.angle))
-        stood.append(max(np.convolve(np.array(angles) < 0.35, np.ones(10), "valid")) == 10)
-    assert sum(stood) >= 6
-
-
 def test_pendulum_needs_no_display(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import pygame
 
@@ -165,23 +131,6 @@ def test_joints_move_as_commanded(recordings: dict[str, Recorded]) -> None:
     for i in range(EPISODES):
         moving = recorded.states(i)[1:, 2:]
         assert np.median(np.abs(moving - recorded.actions(i)[:-1])) < 0.01
-
-
-def test_recorded_angles_are_the_integral_of_recorded_velocities(recordings: dict[str, Recorded]) -> None:
-    states = recordings["planar_arm"].states(0)
-    turned = np.diff(np.unwrap(states[:, 0]))
-    np.testing.assert_allclose(turned, states[1:, 2] / planar_arm.HZ, atol=0.05)
-    assert np.corrcoef(turned, states[1:, 2])[0, 1] > 0.98
-
-
-def test_pictures_show_the_links_at_their_recorded_angles(recordings: dict[str, Recorded]) -> None:
-    upper, fore = list(planar_arm.UPPER_COLOR), list(planar_arm.FORE_COLOR)
-    recorded = recordings["planar_arm"]
-    for picture, state in zip(recorded.pictures(2), recorded.states(2), strict=True):
-        elbow, tip = planar_arm.elbow_and_tip(state[:2])
-        first, second = ((p / 4).astype(int) for p in ((planar_arm.BASE + elbow) / 2, (elbow + tip) / 2))
-        assert picture[first[1], first[0]].tolist() in (upper, fore)  # the forearm may lie on top
-        assert picture[second[1], second[0]].tolist() == fore
 
 
 def test_tip_goes_to_the_point_asked_for() -> None:
@@ -212,12 +161,6 @@ def test_reward_is_the_blocks_way_and_they_stay_within_the_walls(recordings: dic
             np.testing.assert_allclose(demo["rewards"][:-1], moved, atol=1e-9)
             assert places.min() > 20 and places.max() < planar_arm.ARENA - 20
             assert (demo["rewards"][:] > 0.5).any() or not demo.attrs["success"]
-
-
-def test_arm_shoves_blocks_in_most_episodes(tmp_path: Path) -> None:
-    with h5py.File(record("planar_arm", tmp_path, 10, seed=1)) as file:
-        outcomes = [bool(demo.attrs["success"]) for demo in file["data"].values()]
-    assert sum(outcomes) >= 5
 
 
 def test_elbow_holds_at_its_stop() -> None:

@@ -28,7 +28,7 @@ def recorded(robot: Embodiment, folder: Path) -> tuple[Clip, NDArray[np.uint8]]:
     return clip, prepare(clip.frames_at(camera.name, np.arange(len(clip))), camera, SIZE)
 
 
-SLOW = ("pusht_fast", "arm1_02", "arm3_55", "arm4_04", "mover_10", "gantry_04", "rails_09")
+SLOW = ("pusht_fast", "arm4_04", "gantry_04", "rails_09")
 
 
 @pytest.mark.parametrize(
