@@ -71,13 +71,16 @@ class _Dumper(yaml.SafeDumper):
 def _mapping(dumper: _Dumper, value: dict[str, Any]) -> yaml.Node:
     node = dumper.represent_dict(value.items())
     parts = [item for each in value.values() for item in (each if isinstance(each, list) else [each])]
-    node.flow_style = not any(isinstance(part, dict) for part in parts) and len(repr(value)) < MAX_FLOW_CHARS
+    node.flow_style = _on_one_line(value, parts)
     return node
 
 
 def _list(dumper: _Dumper, value: list[Any]) -> yaml.Node:
-    flow = not any(isinstance(item, dict) for item in value) and len(repr(value)) < MAX_FLOW_CHARS
-    return dumper.represent_sequence("tag:yaml.org,2002:seq", value, flow_style=flow)
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", value, flow_style=_on_one_line(value, value))
+
+
+def _on_one_line(value: Any, parts: Iterable[Any]) -> bool:
+    return not any(isinstance(part, dict) for part in parts) and len(repr(value)) < MAX_FLOW_CHARS
 
 
 _Dumper.add_representer(dict, _mapping)
@@ -155,10 +158,8 @@ def _in_registry(found: Inspection, values: dict[str, Any]) -> str:
     They have the recording's URI; or its format, its action keys with as many values, and cameras that are
     all recorded. Where some of them name the values as the recording does, the others are left out.
     """
-    components = [
-        (part["key"], part["dims"], part.get("names", ())) for part in values["action"]["components"]
-    ]
-    recorded, width = {key.key for key in found.keys}, sum(count for _, count, _ in components)
+    components = values["action"]["components"]
+    recorded, width = {key.key for key in found.keys}, sum(part["dims"] for part in components)
     at, alike, named = [], [], []
     for entry in entries():
         if not entry.facts or entry.facts["format"] != found.format:
@@ -167,11 +168,11 @@ def _in_registry(found: Inspection, values: dict[str, Any]) -> str:
             at.append(entry.facts["id"])
         elif entry.facts["action_dim"] == width:
             robot = Embodiment.load(entry.path)
-            parts = [(part.key, part.dims, part.names or ()) for part in robot.action.components]
+            parts = robot.to_dict()["action"]["components"]
             if _widths(parts) == _widths(components) and {one.key for one in robot.cameras} <= recorded:
                 alike.append(robot.id)
-                same = [name for *_, names in parts for name in names]
-                named += [robot.id] if same == [name for *_, names in components for name in names] else []
+                if _names(parts) == _names(components):
+                    named.append(robot.id)
     ids = at or named or alike
     if not ids:
         return ""
@@ -183,12 +184,13 @@ def _place(uri: str) -> str:
     return uri.rstrip("/") if "://" in uri else str(Path(uri).resolve())
 
 
-def _widths(parts: Iterable[tuple[str, int, Any]]) -> Counter[str]:
+def _widths(components: Iterable[dict[str, Any]]) -> Counter[str]:
     """Return the number of values by key: one key may be cut into several components."""
-    widths: Counter[str] = Counter()
-    for key, count, _ in parts:
-        widths[key] += count
-    return widths
+    return Counter(part["key"] for part in components for _ in range(part["dims"]))
+
+
+def _names(components: Iterable[dict[str, Any]]) -> list[str]:
+    return [name for part in components for name in part.get("names", ())]
 
 
 class _Draft:
