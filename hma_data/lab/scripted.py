@@ -113,9 +113,10 @@ class SeenPose:
 
     def __init__(self, robot: str, own: Ints, places: Floats) -> None:
         self._own = own
-        self._body = Body.of(robot) if FAMILY.fullmatch(robot) else None
-        self._forward = planar_arm.link_middles if self._body is None else self._body.own
-        low, high = np.array([[-np.pi, -np.pi], [np.pi, np.pi]]) if self._body is None else self._body.limits
+        self._body = body = Body.of(robot) if FAMILY.fullmatch(robot) else None
+        self._forward: Callable[[Floats], Floats] = body.own if body else planar_arm.link_middles
+        self._bounded: Callable[[Floats], Floats] = body.bounded if body else wrapped
+        low, high = body.limits if body else np.array([[-np.pi, -np.pi], [np.pi, np.pi]])
         self._width = high - low
         starts = np.random.default_rng(0).uniform(low, high, (STARTS, len(low)))
         found = [self._search(start, places) for start in starts]
@@ -126,17 +127,17 @@ class SeenPose:
     def state(self) -> SceneState:
         """Return the state as it is now."""
         holding = False
-        if self._body is not None and self._body.grip and self._body.holds(self.pose):
+        if self._body and self._body.holds(self.pose):
             tip, _ = self._body.mechanism.tip(self.pose)
             holding = bool((np.linalg.norm(self._blocks - tip, axis=1) < REACH).any())
         return SceneState(self.pose, self._blocks, holding)
 
     def move(self, action: Float32s) -> None:
         """See SeenPush."""
-        if self._body is None:
-            self.pose = self.pose + action / planar_arm.HZ
-        else:
+        if self._body:
             self.pose = self._body.moved(self.pose, action.astype(np.float64))
+        else:
+            self.pose = self.pose + action / planar_arm.HZ
 
     def see(self, places: Floats) -> None:
         """See SeenPush."""
@@ -150,7 +151,5 @@ class SeenPose:
         """Return the pose near another whose parts lie at places."""
         from scipy.optimize import least_squares
 
-        found: Floats = least_squares(
-            self._miss, pose, x_scale=self._width, max_nfev=ROUNDS, args=(places,)
-        ).x
-        return wrapped(found) if self._body is None else self._body.bounded(found)
+        found = least_squares(self._miss, pose, x_scale=self._width, max_nfev=ROUNDS, args=(places,)).x
+        return self._bounded(found)

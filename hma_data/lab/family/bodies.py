@@ -10,6 +10,7 @@ Q axes of a pose, A actions, B blocks.
 import zlib
 from dataclasses import dataclass
 from functools import cache, cached_property
+from typing import Any
 
 import numpy as np
 
@@ -91,10 +92,14 @@ class Body:
         """Return the A axes of the action."""
         return self.mechanism.commands
 
+    def each(self, fact: str) -> Any:
+        """Return a fact of each axis of the pose (Q,), such as speed."""
+        return np.array([getattr(axis, fact) for axis in self.axes])
+
     @cached_property
     def limits(self) -> Floats:
         """Return the (2, Q) limits of the pose."""
-        return np.array([[a.low for a in self.axes], [a.high for a in self.axes]])
+        return np.stack([self.each("low"), self.each("high")])
 
     @cached_property
     def ranges(self) -> Floats:
@@ -127,14 +132,11 @@ class Body:
             ahead = direction(heading) * action[0] * step
             pose = np.array([*(pose[:2] + ahead), heading])
         else:
-            speed = np.array([a.speed for a in self.axes])
-            follows = np.array([a.target for a in self.axes])
             lag = np.array([a.lag or 1.0 for a in self.axes])
-            velocity = np.where(follows, (action - pose) / lag, action)
-            pose = pose + np.clip(velocity, -speed, speed) * step
+            velocity = np.where(self.each("target"), (action - pose) / lag, action)
+            pose = pose + np.clip(velocity, -self.each("speed"), self.each("speed")) * step
         return self.bounded(pose)
 
     def bounded(self, pose: Floats) -> Floats:
         """Return a pose (Q,) within the limits; angles that turn without end are kept within ±π."""
-        turning = np.array([a.turns for a in self.axes])
-        return np.where(turning, wrapped(pose), np.clip(pose, *self.limits))
+        return np.where(self.each("turns"), wrapped(pose), np.clip(pose, *self.limits))

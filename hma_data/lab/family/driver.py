@@ -31,7 +31,7 @@ class Driver:
         self._body, self._rng, self._chances = body, rng, chances
         self._tops = np.array([axis.speed for axis in body.commands])
         self._follows = np.array([axis.target for axis in body.commands])
-        self._turns = np.array([axis.turns for axis in body.axes])
+        self._turns = body.each("turns")
         self._sign = np.ones(len(body.commands))
         self._setpoint = pose[: len(body.commands)].copy()
         self._left = 0
@@ -182,9 +182,7 @@ class Reacher:
         if body.car:
             return np.clip(steered(body, pose, self._aim), low, high)
         velocity = GAIN * self._way(pose, self._aim - tip)
-        lag = np.array([axis.lag for axis in body.axes])
-        follows = np.array([axis.target for axis in body.axes])
-        action = np.where(follows, pose + velocity * lag, velocity)
+        action = np.where(body.each("target"), pose + velocity * body.each("lag"), velocity)
         if body.grip:
             action[-1] = float(body.grip == "gripper")  # open, or off
         return np.clip(action, low, high)
