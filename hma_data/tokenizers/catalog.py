@@ -5,7 +5,6 @@ To add a tokenizer, add a row to `CATALOG`, or have an installed package add an 
 imports neither torch nor a built-in tokenizer's module.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from importlib.util import find_spec
@@ -15,7 +14,7 @@ from typing import Any, Literal, get_args
 from hma_data.episodes.images import Filter
 from hma_data.errors import PluginError, TokenizerError, install_command
 from hma_data.plugins import TOKENIZER_GROUP, Plugin, installed
-from hma_data.storage.files import file_sha256
+from hma_data.storage.files import file_sha256, opened_weights
 
 EMBEDDED = Path(__file__).parent / "weights"
 
@@ -74,9 +73,8 @@ class Entry:
         if self.weights != "embedded":
             return ""
         path = EMBEDDED / self.file
-        with path.open("rb") as file:  # a safetensors file begins with the size of its header
-            header = json.loads(file.read(int.from_bytes(file.read(8), "little")))
-        return header.get("__metadata__", {}).get("tokens_sha256") or file_sha256(path)
+        with opened_weights(path) as file:
+            return (file.metadata() or {}).get("tokens_sha256") or file_sha256(path)
 
     def state(self) -> str:
         """Return "ready" or what it still needs: an install, a path, or a download on first use."""

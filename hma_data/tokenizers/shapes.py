@@ -146,8 +146,6 @@ def read_colors(path: Path) -> NDArray[np.uint8]:
     if path.suffix == ".json":
         spec = read_json(path, TokenizerError).get("tokenizer")
         return parse_colors(spec.get("colors") if isinstance(spec, dict) else None, path)
-    if path.is_dir():
-        raise TokenizerError(path, "is a folder, not a file of colours", _COLORS)
     with opened_weights(path, TokenizerError) as file:
         held = file.keys()
         colors: Array = file.get_tensor("colors") if "colors" in held else np.zeros(0)
@@ -159,10 +157,9 @@ def read_colors(path: Path) -> NDArray[np.uint8]:
 
 def parse_colors(text: Any, where: object) -> NDArray[np.uint8]:
     """Return the colours (K, 3) of a value of `TokenizerSpec.colors`; raise TokenizerError for another."""
-    if not isinstance(text, str) or not re.fullmatch("[0-9a-f]*", text) or len(text) % 6:
-        raise TokenizerError(where, "holds no colours in hex, six digits each", _COLORS)
-    if not 2 <= len(text) // 6 <= MOST_COLORS:
-        raise TokenizerError(where, f"has {len(text) // 6} colours, not 2 to {MOST_COLORS}", _COLORS)
+    if not isinstance(text, str) or not re.fullmatch(f"([0-9a-f]{{6}}){{2,{MOST_COLORS}}}", text):
+        fault = f"holds no colours: 2 to {MOST_COLORS} in hex, six digits each"
+        raise TokenizerError(where, fault, _COLORS)
     return np.frombuffer(bytes.fromhex(text), np.uint8).reshape(-1, 3)
 
 

@@ -150,7 +150,7 @@ def recording_films(
     Args:
         uri: str or path of the recording, or its URI.
         frames: number of frames taken from each of up to 16 episodes, evenly spaced.
-        on_skip: called with the reason for each episode that cannot be read; another episode replaces it.
+        on_skip: called with the reason for each episode that cannot be read.
 
     Raises:
         SourceError: the recording cannot be read, or none of its episodes can be read.
@@ -159,12 +159,8 @@ def recording_films(
 
     source = open_source(embodiment.source.format)
     ids = [ref.id for ref in source.index(uri, embodiment)]
-    spread = sampled(len(ids), EPISODES)
-    others = [index for index in range(len(ids)) if index not in set(spread)]
-    read, fault = 0, "it holds no episode"
-    for index in spread + others:
-        if read == EPISODES:
-            return
+    read, fault = False, "it holds no episode"
+    for index in sampled(len(ids), EPISODES):
         try:
             episode = source.read(uri, ids[index], embodiment)
             for camera in embodiment.cameras:
@@ -172,7 +168,7 @@ def recording_films(
                 drawn = (stream.frames([at]) for at in sampled(len(stream.timestamps), frames))
                 film = [prepare(frame, camera, spec.image_size, spec.resize_filter) for frame in drawn]
                 yield np.concatenate(film)
-            read += 1
+            read = True
         except (EpisodeError, SourceError) as problem:
             fault = str(problem)
             on_skip(fault)

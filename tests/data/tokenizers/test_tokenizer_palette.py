@@ -113,7 +113,7 @@ def test_a_file_of_other_values_is_refused(tmp_path: Path, colors: Colors) -> No
     save_file({"colors": colors}, path)
     with pytest.raises(TokenizerError, match=r"own.safetensors: its colours are .* — name a file"):
         get_tokenizer("palette-64", weights=path)
-    with pytest.raises(TokenizerError, match="is a folder, not a file of colours"):
+    with pytest.raises(TokenizerError, match=r"not a complete safetensors file"):
         get_tokenizer("palette-64", weights=tmp_path)
     path.write_bytes(b"no")
     with pytest.raises(TokenizerError, match=r"own.safetensors: "):
@@ -130,7 +130,7 @@ def test_colours_of_a_spec_open_no_file_and_are_never_too_many(name, colors, tmp
     monkeypatch.setattr("hma_data.tokenizers.palette.Nearest", None)  # a table for millions of colours
     spec = {"name": name, "colors": colors}
     if name == "palette-64":
-        with pytest.raises(TokenizerError, match="palette-64: (holds no|has 1|has 256) colours"):
+        with pytest.raises(TokenizerError, match="palette-64: holds no colours"):
             reopened(spec)
     else:
         assert reopened(spec).spec == get_spec("fsq-16")
