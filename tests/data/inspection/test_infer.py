@@ -441,14 +441,18 @@ def test_a_recording_without_commands_proposes_its_own_position_as_a_question(tm
 # -- LeRobot
 
 
-@pytest.mark.parametrize("shape", [[480, 640, 3], [480, 640, 4], [480, 640]])
-def test_the_size_of_frames_is_measured_whatever_info_json_states(tmp_path: Path, shape: list[int]) -> None:
-    path = make_v2(tmp_path / "set")
-    seen = [camera["size"] for camera in inferred(path)["cameras"]]
-    info = json.loads((path / "meta/info.json").read_text())
-    info["features"][CAMERA]["shape"] = shape
-    (path / "meta/info.json").write_text(json.dumps(info))
-    assert [camera["size"] for camera in inferred(path)["cameras"]] == seen
+def with_features(folder: Path, change: Callable[[dict[str, Any]], None]) -> Path:
+    """A dataset whose info.json states other features than its files have."""
+    file = make_v2(folder) / "meta/info.json"
+    info = json.loads(file.read_text())
+    change(info["features"])
+    file.write_text(json.dumps(info))
+    return folder
+
+
+def test_the_size_of_frames_is_measured_whatever_info_json_states(tmp_path: Path) -> None:
+    path = with_features(tmp_path / "set", lambda features: features[CAMERA].update(shape=[480, 640, 4]))
+    assert [camera["size"] for camera in inferred(path)["cameras"]] == [[64, 96]] * 2
 
 
 @pytest.mark.parametrize("make", [make_v2, make_v3])
@@ -483,33 +487,26 @@ def test_lerobot_names_rate_words_and_robot(tmp_path: Path, make: Callable[..., 
     ],
 )
 def test_lerobot_names_in_every_form(tmp_path: Path, stated: Any, names: list[str] | None) -> None:
-    path = make_v2(tmp_path / "set")
-    info = json.loads((path / "meta/info.json").read_text())
-    info["features"]["action"]["names"] = stated
-    (path / "meta/info.json").write_text(json.dumps(info))
-    values = inferred(path)
-    assert values["action"]["components"][0].get("names") == names
+    path = with_features(tmp_path / "set", lambda features: features["action"].update(names=stated))
+    assert inferred(path)["action"]["components"][0].get("names") == names
 
 
 def test_the_currents_of_motors_are_no_state(tmp_path: Path) -> None:  # as AgiBot World has them
-    path = make_v2(tmp_path / "set")
-    info = json.loads((path / "meta/info.json").read_text())
-    state = info["features"]["observation.state"]
-    info["features"] |= {f"observation.states.joint.{name}": state for name in ("current_value", "position")}
-    del info["features"]["observation.state"]
-    (path / "meta/info.json").write_text(json.dumps(info))
+    def change(features: dict[str, Any]) -> None:
+        state = features.pop("observation.state")
+        features |= {f"observation.states.joint.{name}": state for name in ("current_value", "position")}
+
+    path = with_features(tmp_path / "set", change)
     assert keys(inferred(path), "state") == ["observation.states.joint.position"]
 
 
 def test_lerobot_depth_and_grey_features_are_left_out(tmp_path: Path) -> None:
-    path = make_v2(tmp_path / "set")
-    info = json.loads((path / "meta/info.json").read_text())
-    whole = info["features"][CAMERA]
-    info["features"][STILL]["shape"] = [64, 96, 1]
-    info["features"]["observation.images.depth_high"] = whole
-    info["features"]["observation.images.far"] = whole | {"info": {"video.is_depth_map": True}}
-    (path / "meta/info.json").write_text(json.dumps(info))
-    assert keys(inferred(path), "cameras") == [CAMERA]
+    def change(features: dict[str, Any]) -> None:
+        features[STILL]["shape"] = [64, 96, 1]
+        features["observation.images.depth_high"] = features[CAMERA]
+        features["observation.images.far"] = features[CAMERA] | {"info": {"video.is_depth_map": True}}
+
+    assert keys(inferred(with_features(tmp_path / "set", change)), "cameras") == [CAMERA]
 
 
 # -- real recordings

@@ -369,12 +369,6 @@ def test_the_worst_comes_first(tmp_path: Path) -> None:
     assert order == sorted(order, key=["error", "warn", "info"].index) and len(set(order)) > 1
 
 
-def test_an_unreadable_recording_is_one_error(tmp_path: Path) -> None:
-    (tmp_path / "no.hdf5").write_bytes(b"nothing")
-    (finding,) = examine(str(tmp_path / "no.hdf5"))
-    assert (finding.check, finding.severity) == ("readable", "error")
-
-
 def test_a_shard_set_with_changed_bytes_is_an_error(tmp_path, toy_arm, toy_recording, block_tokenizer):
     convert(toy_arm, str(toy_recording), block_tokenizer, tmp_path / "shards")
     assert not [finding for finding in examine(str(tmp_path / "shards")) if finding.severity == "error"]
