@@ -97,9 +97,8 @@ class Entry:
     def to_json(self) -> dict[str, Any]:
         """Return plain values, with the state and the measured size."""
         values = {key: value for key, value in asdict(self).items() if key not in ("module", "arguments")}
-        lists = {"grid": list(self.grid), "imports": list(self.imports)}
         state = {"missing": self.missing(), "state": self.state(), "usable": self.state() == "ready"}
-        return values | lists | {"bytes": self.size()} | state
+        return values | {"bytes": self.size()} | state
 
 
 _MAGVIT2 = Entry(
