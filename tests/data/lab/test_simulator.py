@@ -51,6 +51,31 @@ def test_recorded_commands_give_the_recorded_pictures_and_states(robot: str, tmp
     np.testing.assert_allclose(np.stack(states), clip.states, atol=1e-6)
 
 
+# Means of 31 pictures, of 30 commands (absolute), and of the last state.
+KNOWN = {
+    "pusht_fast": (250.180, 302.6623, 326.1109),
+    "pusht_slow": (249.875, 65.4171, 201.4131),
+    "pendulum": (246.463, 1.8371, 1.5072),
+    "planar_arm": (216.125, 0.8864, 0.8545),
+    "arm3_55": (61.154, 0.9771, 0.3277),
+    "mover_52": (174.152, 14.4302, 76.2550),
+    "gantry_04": (69.392, 9.8523, 36.4594),
+    "rails_09": (172.073, 70.3632, 56.5088),
+    "crane_01": (207.385, 6.3960, 8.1588),
+}
+
+
+@pytest.mark.parametrize("robot", KNOWN)
+def test_a_robot_looks_and_moves_as_when_bundled_models_were_trained(robot: str) -> None:
+    simulator, commands = LabSimulator(robot), []
+    pictures = [simulator.reset(0, 0)]
+    for _ in range(30):
+        commands.append(simulator.recorded())
+        pictures.append(simulator.step(commands[-1]))
+    found = np.mean(pictures), np.abs(commands).mean(), np.mean(simulator.state)
+    assert found == pytest.approx(KNOWN[robot], rel=1e-3)
+
+
 @pytest.mark.slow
 def test_pusht_slow_follows_its_recording_up_to_the_jitter(tmp_path: Path) -> None:
     simulator = LabSimulator("pusht_slow")
