@@ -193,6 +193,7 @@ def write_lerobot(
             writer.save_episode()
     finally:
         writer.close()
+    _sort_stats(folder)
     if made_by is not None:
         (folder / "embodiment.yaml").write_text(embodiment.to_yaml(), encoding="utf-8")
         (folder / ORIGIN).write_text(json.dumps(made_by, indent=1), encoding="utf-8")
@@ -215,7 +216,12 @@ def join_datasets(parts: Sequence[Path], folder: Path, name: str) -> None:
     finally:
         aggregate.tqdm = bars
     _share_videos(folder)
-    stats = folder / "meta" / "stats.json"  # lerobot writes its features in another order in each process
+    _sort_stats(folder)
+
+
+def _sort_stats(folder: Path) -> None:
+    """Sort the statistics of a dataset: lerobot writes its features in another order in each process."""
+    stats = folder / "meta" / "stats.json"
     stats.write_text(json.dumps(read_json(stats, SourceError), indent=4, sort_keys=True), encoding="utf-8")
 
 

@@ -1,5 +1,6 @@
 """The laboratory's LeRobotDataset: what lerobot wrote of the planar arm, read by lerobot and by us."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,11 @@ def test_lerobot_finds_the_robot_and_its_names_in_the_metadata(theirs: Any) -> N
     assert theirs.meta.info.codebase_version == "v3.0"
     assert (theirs.fps, theirs.meta.robot_type) == (robot.frequency_hz, robot.robot)
     assert theirs.features["action"]["names"] == list(robot.action.names())
+
+
+def test_statistics_are_in_one_order_in_every_process(recorded: Path) -> None:
+    told = json.loads((recorded / "meta/stats.json").read_text())
+    assert len(told) > 4 and list(told) == sorted(told)
 
 
 def test_the_episodes_are_those_of_the_recording_in_hdf5(recorded: Path, tmp_path: Path) -> None:
