@@ -231,9 +231,8 @@ def _astray(key: str, offset: Offset, runs: list[tuple[Floats, Floats]], sync: S
             stated = sync.actions + (f", tolerance_ms {sync.tolerance_ms:g}" if sync.tolerance_ms else "")
             fault = f"{share:.0%} of frames get the action of the frame {side} them"
             said = f"{key}: {fault} by actions: {stated}; {offset.said}"
-            remedy = f"set sync: {{{offset.pairing}}}" + (
-                "" if offset.tolerance_ms else " without tolerance_ms"
-            )
+            without = "" if offset.tolerance_ms else " without tolerance_ms"
+            remedy = f"set sync: {{{offset.pairing}}}{without}"
             return Finding("offset", "warn", said, remedy, key, {"share": share})
     return None
 

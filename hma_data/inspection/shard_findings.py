@@ -19,6 +19,7 @@ from hma_data.shards.preview import tokenizer_of
 from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.recorded import Recorded
 from hma_data.shards.schema import token_column
+from hma_data.shards.windows import WINDOW, WindowIndex
 from hma_data.sources.common.checks import Finding, Severity
 from hma_data.sources.common.survey import listed, sampled
 from hma_data.storage.paths import StrPath
@@ -49,8 +50,6 @@ def pause_finding(shards: ShardSet) -> Finding | None:
 
     It is a warning where they cost more than a tenth of the windows.
     """
-    from hma_data.shards.windows import WINDOW, WindowIndex
-
     flagged, total = _flagged(shards, PAUSED), len(shards.episodes)
     if not len(flagged):
         return None
@@ -67,8 +66,6 @@ def pause_finding(shards: ShardSet) -> Finding | None:
 
 def window_finding(shards: ShardSet) -> Finding | None:
     """Return a finding where no training episode is as long as a window; None otherwise."""
-    from hma_data.shards.windows import WINDOW, WindowIndex
-
     if not shards.manifest.splits["train"]["episodes"] or WindowIndex.of(shards, "train", WINDOW).count:
         return None
     lengths = np.sort(shards.index("train").length)
@@ -117,11 +114,7 @@ def _measured(shards: ShardSet, episodes: pa.Table) -> tuple[str, float | None]:
 EPISODES, FRAMES = 3, 12  # episodes compared, and frames of each, evenly spaced
 
 
-def kept_findings(
-    shards: ShardSet,
-    weights: StrPath | None = None,
-    device: str = "cpu",
-) -> Iterator[Finding]:
+def kept_findings(shards: ShardSet, weights: StrPath | None = None, device: str = "cpu") -> Iterator[Finding]:
     """Yield for each camera how well what moves is kept by the tokens, in a few episodes of all splits.
 
     It is a warning where the moving parts are lost, or where the crop cuts them off. Where the recording or
