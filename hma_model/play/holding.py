@@ -51,9 +51,8 @@ def holdings(checkpoint: Checkpoint) -> dict[str, Holding]:
     known = measured.get(checkpoint.trunk_sha256, {})
     found = {}
     for name in checkpoint.embodiments:
-        verdict = str(value_of(checkpoint.card(name).get("evaluation"), "verdict"))
-        says = {"follows": True, "does not follow": False}
-        follows = next((value for words, value in says.items() if verdict.startswith(words)), None)
+        follows = value_of(checkpoint.card(name).get("evaluation"), "follows")
         own = known.get(name, {})
-        found[name] = Holding(own.get("seconds"), own.get("at_least", False), follows)
+        judged = follows if isinstance(follows, bool) else None  # a card may come from anybody
+        found[name] = Holding(own.get("seconds"), own.get("at_least", False), judged)
     return found
