@@ -223,15 +223,13 @@ def _summary(facts: dict[str, Any]) -> str:
     if tokenizer:
         parts.append(f"tokenizer {_cell(tokenizer.get('name'))}")
     sha256, size = facts["trunk_sha256"], _megabytes(facts["trunk_bytes"])
-    trunk = f"trunk {_cell(sha256)[:12]}, " if isinstance(sha256, str) else "weights "
-    parts.append(trunk + ("not in the cache" if size is None else f"{size} MB"))
-    if facts["from_cache"]:
-        parts.append("the hub is unreachable, listed from the cache")
+    trunk = f"trunk {_cell(sha256)[:12]}" if isinstance(sha256, str) else "weights"
+    parts.append(f"{trunk}, {size} MB")
     return f"{_cell(facts['checkpoint'], 1000)}: {'; '.join(parts)}; {_state(facts)}"
 
 
-def _megabytes(size: int | None) -> float | None:
-    return None if size is None else round(size / 1e6, 2)
+def _megabytes(size: int) -> float:
+    return round(size / 1e6, 2)
 
 
 def _state(facts: dict[str, Any]) -> str:

@@ -25,15 +25,16 @@ def survey(source: StrPath, revision: str | None = None) -> list[dict[str, Any]]
 
     Returns:
         For each: `checkpoint` (address), `format` (hma-toolkit or released), `format_version`, `model`,
-        `tokenizer`, `trunk_sha256`, `trunk_bytes`, `problems` (why it cannot be used here, or none),
-        `from_cache` (the hub was out of reach, and the facts are from the client's cache) and `embodiments`:
-        rows of id, action, rate, figures, licence, bytes and problems. Bytes that the cache lacks are None.
+        `tokenizer`, `trunk_sha256`, `trunk_bytes`, `problems` (why it cannot be used here, or none) and
+        `embodiments`: rows of id, action, rate, figures, licence, bytes and problems.
 
     Raises:
         HubError: the source does not exist, cannot be reached, or holds no checkpoint.
     """
     store = open_store(source, revision)
     files = store.files()
+    if store.from_cache:  # which has what was pulled, not what is there
+        raise HubError(store.name, "is out of reach", "go online and list again")
     roots = sorted(name.removesuffix(CONFIG) for name in files if f"/{name}".endswith(f"/{CONFIG}"))
     described = (_checkpoint(store, files, root) for root in roots[:MAX_LISTED])
     found = [facts for facts in described if facts]
@@ -55,7 +56,7 @@ def _checkpoint(store: Store, files: Mapping[str, int], root: str) -> dict[str, 
     facts: dict[str, Any] = {
         "checkpoint": where, "format": LIBRARY, "format_version": None, "origin": None, "model": None,
         "tokenizer": None, "trunk_sha256": None, "trunk_bytes": inside.get(TRUNK, 0), "problems": [],
-        "embodiments": [], "from_cache": store.from_cache,
+        "embodiments": [],
     }  # fmt: skip
     try:
         values = read_object(store, root + CONFIG)
@@ -82,7 +83,6 @@ def _add_ours(
 ) -> None:
     """Add what config.json and the cards of a checkpoint of ours say, and what is wrong with them."""
     where, problems, tokenizer = facts["checkpoint"], facts["problems"], values.get("tokenizer")
-    lacks = "the cache lacks" if store.from_cache else "lacks"
     facts |= {key: values.get(key) for key in ("format_version", "trunk_sha256", "tokenizer", "model")}
     problems += _tokenizer_problems(tokenizer)
     try:
@@ -90,14 +90,13 @@ def _add_ours(
     except HMAError as fault:
         problems.append(f"{fault.fault}: {fault.remedy}")
     if TRUNK not in files:
-        problems.append(f"{lacks} {TRUNK}")
-        facts["trunk_bytes"] = None if store.from_cache else 0
+        problems.append(f"lacks {TRUNK}")
     ids = embodiment_ids(files)
     store.warm([f"{root}embodiments/{name}/{CARD}" for name in ids])
     for name in ids:
         home = f"embodiments/{name}"
-        wrong = [f"{lacks} {part}" for part in PARTS if f"{home}/{part}" not in files]
-        size = None if wrong and store.from_cache else sum(files.get(f"{home}/{part}", 0) for part in PARTS)
+        wrong = [f"lacks {part}" for part in PARTS if f"{home}/{part}" not in files]
+        size = sum(files.get(f"{home}/{part}", 0) for part in PARTS)
         try:
             card = read_object(store, f"{root}{home}/{CARD}")
             if card.get("trunk_sha256") != values.get("trunk_sha256"):
@@ -111,7 +110,7 @@ def _add_ours(
         facts["embodiments"].append(_row(name, card, size, wrong))
 
 
-def _row(name: str, card: Mapping[str, Any], size: int | None, problems: list[str]) -> dict[str, Any]:
+def _row(name: str, card: Mapping[str, Any], size: int, problems: list[str]) -> dict[str, Any]:
     return {
         "embodiment": name,
         **{key: card.get(key) for key in ("robot", "action_dim", "chunk_dim", "stride", "data")},
