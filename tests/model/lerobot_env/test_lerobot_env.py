@@ -1,7 +1,6 @@
 """A world model is an environment of lerobot's evaluation; what does not fit ends in one line."""
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,6 +12,7 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.scripts.lerobot_eval import eval_main
 
 from hma_data.errors import HMAError, UsageError
 from hma_data.lab import family
@@ -44,7 +44,7 @@ IMAGE = np.full((64, 64, 3), 90, np.uint8)
 
 
 class Certain:
-    held_out = readable = ()
+    held_out, readable, std, error = (), np.arange(2), np.ones(2), np.full(2, 0.5)
 
     def read(self, pictures: np.ndarray) -> np.ndarray:
         return pictures.reshape(len(pictures), -1)[:, :2].astype(float)
@@ -204,28 +204,35 @@ def test_how_far_a_training_is_is_logged_from_time_to_time(monkeypatch, caplog) 
     assert caplog.messages == [f"{ROBOT}: step 2 of 3"]
 
 
-def test_lerobot_eval_and_its_recording(tmp_path: Path) -> None:
+@pytest.fixture
+def evaluates(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
+    """Run lerobot-eval with two episodes in a model of a robot whose state is read at once."""
+    monkeypatch.setattr(vector, "state_source", lambda *_: lambda world, tell: Certain())
+
+    def run(*words: str) -> dict[str, Any]:
+        own = [
+            "--env.type=hma", f"--env.embodiment={ROBOT}", "--env.horizon=10", "--policy.device=cpu",
+            "--env.discover_packages_path=hma_model.lerobot_env", "--eval.n_episodes=2",
+            "--eval.batch_size=2", f"--output_dir={tmp_path / 'out'}",
+        ]  # fmt: skip
+        monkeypatch.setattr(sys, "argv", ["lerobot-eval", *own, *words])
+        eval_main()
+        return json.loads((tmp_path / "out" / "eval_info.json").read_text())
+
+    return run
+
+
+def test_lerobot_eval_and_its_recording(tmp_path: Path, evaluates: Any, caplog) -> None:
     saved(tmp_path / "policy", state=2)
-    found = subprocess.run(
-        [
-            sys.executable, "-m", "lerobot.scripts.lerobot_eval", f"--policy.path={tmp_path / 'policy'}",
-            "--env.type=hma", "--env.checkpoint=embedded", f"--env.embodiment={ROBOT}",
-            "--env.discover_packages_path=hma_model.lerobot_env", "--env.horizon=10", "--eval.n_episodes=2",
-            "--eval.batch_size=2", "--eval.recording=true", "--policy.device=cpu", RENAME,
-            f"--output_dir={tmp_path / 'out'}",
-        ],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert found.returncode == 0, found.stderr[-3000:]
-    assert "agent_pos is estimated from the images: 2 of 2 values, mean error" in found.stderr
-    info = json.loads((tmp_path / "out" / "eval_info.json").read_text())
+    info = evaluates(f"--policy.path={tmp_path / 'policy'}", "--eval.recording=true", RENAME)
+    assert "agent_pos is estimated from the images: 2 of 2 values, mean error on other" in caplog.text
     assert info["overall"]["n_episodes"] == 2 and info["overall"]["pc_success"] == 0
     recorded = tmp_path / "out" / "recordings" / "hma_0" / "env_0"
     facts = json.loads((recorded / "meta" / "info.json").read_text())
     assert facts["total_frames"] == 10 and facts["fps"] == HMAEnvConfig(embodiment=ROBOT).fps
     assert {"pixels", "agent_pos", "action", "synthetic", "next.success"} <= facts["features"].keys()
     assert origin_of(recorded.joinpath) == {"by": "lerobot-eval", "synthetic": True}
-    assert "no judge is given, so pc_success will be 0" in found.stderr
+    assert "no judge is given, so pc_success will be 0" in caplog.text
 
 
 # -- policies
@@ -315,16 +322,6 @@ def test_its_folder_as_the_path_of_a_policy_is_told_the_way_that_works(run, monk
         HMAEnvConfig(embodiment=ROBOT)
 
 
-def test_lerobot_eval_runs_it(run: Path, tmp_path: Path) -> None:
-    found = subprocess.run(
-        [
-            sys.executable, "-m", "lerobot.scripts.lerobot_eval", "--policy.type=hma",
-            f"--policy.checkpoint={run}", "--policy.device=cpu", "--env.type=hma",
-            f"--env.embodiment={ROBOT}",
-            "--env.discover_packages_path=hma_model.lerobot_env", "--env.horizon=10", "--env.state=false",
-            "--eval.n_episodes=2", "--eval.batch_size=2", f"--output_dir={tmp_path / 'out'}",
-        ],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert found.returncode == 0, found.stderr[-3000:]
-    assert json.loads((tmp_path / "out" / "eval_info.json").read_text())["overall"]["n_episodes"] == 2
+def test_lerobot_eval_runs_it(run: Path, evaluates: Any) -> None:
+    info = evaluates("--policy.type=hma", f"--policy.checkpoint={run}", "--env.state=false")
+    assert info["overall"]["n_episodes"] == 2
