@@ -59,23 +59,6 @@ def other_robot(source: Path, out: Path, name: str, dims: int, seed: int) -> Pat
     return out
 
 
-@pytest.mark.parametrize(
-    ("address", "repository"),
-    [
-        ("org/name", True), ("hf://org/name", True), ("./org/name", False), ("/org/name", False),
-        ("a/b/c", False), ("s3://bucket/name", False), ("~/models/x", False), (Path("org/name"), False),
-        ("name", False),
-    ],
-)  # fmt: skip
-def test_which_addresses_are_repositories_and_a_folder_that_is_there_is_none(
-    address, repository, tmp_path, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
-    assert hub.is_repository(address) is repository
-    (tmp_path / "org/name").mkdir(parents=True)
-    assert not hub.is_repository("org/name")
-
-
 def test_what_is_pushed_and_pulled_is_the_same(source, target, tmp_path):
     hub.push(source, target)
     pulled = hub.pull(target, out=tmp_path / "pulled")

@@ -12,7 +12,6 @@ from hma_data.conversion import publish
 from hma_data.errors import HubError, ShardError
 from hma_data.shards.reader import ShardSet
 from hma_data.tokenizers.shapes import palette_spec
-from hma_model.hub import stores
 from hma_model.hub.datasets import pull_data, push_data
 from hma_model.hub.stores import FolderStore
 from tests.conftest import SMALL, contents, toy_shards
@@ -94,25 +93,6 @@ def test_a_folder_is_listed_as_often_however_many_batches_are_pushed(tmp_path, m
     assert few == many
 
 
-def test_a_push_to_a_folder_finds_that_another_robots_set_came_meanwhile(tmp_path, monkeypatch):
-    monkeypatch.setattr(publish, "FILES", 1)
-    ours = toy_shards(tmp_path / "toy", [20] * 6, replace(SMALL, shard_frames=20))
-    theirs, out = make_shards(tmp_path / "theirs", "hand"), tmp_path / "out"
-    plain, pushed = FolderStore.publish, []
-
-    def between(store, changes, message):
-        if pushed == [1, 2]:
-            shutil.copytree(theirs, out, dirs_exist_ok=True)
-        pushed.append(len(pushed) + 1)
-        return plain(store, changes, message)
-
-    monkeypatch.setattr(FolderStore, "publish", between)
-    with pytest.raises(HubError, match="holds the shard set of hand"):
-        push_data(ours, str(out))
-    assert (out / "manifest.json").read_bytes() == (theirs / "manifest.json").read_bytes()
-    assert pushed == [1, 2, 3]
-
-
 def test_a_push_that_was_cut_goes_on_with_what_is_missing(server, shards, monkeypatch):
     monkeypatch.setattr(publish, "FILES", 1)
     server.fail("PUT /lfs/", times=1, status=403)
@@ -168,16 +148,11 @@ def test_a_set_made_anew_replaces_the_old_one_whole(server, shards, tmp_path):
     assert contents(pull_data(REPO, tmp_path / "out")) == contents(shards)
 
 
-def test_a_pull_looks_for_parts_of_killed_ones_once_a_folder(tmp_path, monkeypatch):
-    there = toy_shards(tmp_path / "toy", [20] * 6, replace(SMALL, shard_frames=20))
-    remove, folders = stores.remove_dead_parts, []
-    monkeypatch.setattr(stores, "remove_dead_parts", lambda folder: folders.append(folder) or remove(folder))
+def test_a_pull_removes_what_a_killed_one_has_left(shards: Path, tmp_path: Path) -> None:
     left = tmp_path / "out/train/.shard-00000.parquet.999999999.part"
     left.parent.mkdir(parents=True)
     left.touch()
-    out = pull_data(str(there), tmp_path / "out")
-    assert contents(out) == contents(there)
-    assert sorted(one for one in folders if one.is_relative_to(out)) == [out, out / "train", out / "val"]
+    assert contents(pull_data(str(shards), tmp_path / "out")) == contents(shards)
 
 
 def test_another_robots_set_is_not_overwritten(server, shards, tmp_path):

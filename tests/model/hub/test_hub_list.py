@@ -19,7 +19,6 @@ from hma_model.hub import publish as hub
 from hma_model.hub.listing import survey
 from hma_model.hub.sample import add_samples
 from hma_model.worlds.images import sample_image
-from tests.hub_server import connect, serve
 from tests.model.robots import Blocks, make_model, save
 from tests.model.shards import make_shards
 
@@ -108,16 +107,6 @@ def test_a_strangers_text_cannot_steer_the_terminal(folder):
     shown = CliRunner().invoke(app, ["hub", "list", str(folder)])
     assert shown.exit_code == 0 and r"\x1b[2J\x1b]0;gone\x07[red]" in shown.stdout
     assert "\x1b" not in shown.stdout and "\x07" not in shown.stdout
-
-
-def test_a_released_repository_is_listed_without_its_weights_being_sent(shelf, tmp_path, monkeypatch):
-    with serve() as server:
-        connect(monkeypatch, server, tmp_path / "cache", None)
-        released = shelf / "liruiw/hma-base"
-        names = ("config.json", "model.safetensors")
-        server.create("liruiw/hma-base").commit({name: (released / name).read_bytes() for name in names})
-        (facts,) = survey("liruiw/hma-base")
-        assert facts["format"] == "released" and set(server.sent()) == {"config.json"}
 
 
 def test_a_sample_shows_truth_and_predictions_over_time(folder, tmp_path, painted):

@@ -6,6 +6,7 @@ import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -460,21 +461,18 @@ def test_a_page_whose_server_stopped_says_so_and_goes_on_when_it_is_back(browser
         page.context.close()
 
 
-@pytest.mark.parametrize(("width", "height"), [(390, 844), (844, 390), (667, 375), (820, 1180), (1024, 600)])
-def test_the_images_and_the_run_button_fit_on_the_screen_side_by_side(browser, address, width, height):
-    context = browser.new_context(viewport={"width": width, "height": height})
-    page = opened(context.new_page(), address)
-    page.wait_for_timeout(100)
-    assert page.evaluate("() => document.documentElement.scrollWidth") <= width
-    boxes = [page.locator(one).bounding_box() for one in ("#stage", "#true-view", ".side .card >> nth=0")]
-    for number, one in enumerate(boxes):
-        for other in boxes[number + 1 :]:
+def test_the_images_and_the_run_button_fit_on_the_screen_side_by_side(page: "Page") -> None:
+    for width, height in ((390, 844), (844, 390), (667, 375), (820, 1180), (1024, 600)):
+        page.set_viewport_size({"width": width, "height": height})
+        page.wait_for_timeout(100)
+        assert page.evaluate("() => document.documentElement.scrollWidth") <= width
+        boxes = [page.locator(one).bounding_box() for one in ("#stage", "#true-view", ".side .card >> nth=0")]
+        for one, other in combinations(boxes, 2):
             assert one and other
             apart = one["x"] + one["width"] <= other["x"] or one["y"] + one["height"] <= other["y"]
             assert apart or other["x"] + other["width"] <= one["x"]
-    button = page.locator("#run").bounding_box()
-    assert button and button["y"] + button["height"] <= height
-    context.close()
+        button = page.locator("#run").bounding_box()
+        assert button and button["y"] + button["height"] <= height
 
 
 def test_the_question_mark_explains_the_page_and_the_keys_rest_meanwhile(page, stepper) -> None:
