@@ -22,7 +22,7 @@ from hma_data.registry.components import Camera, Component
 from hma_data.registry.embodiment import Embodiment
 from hma_data.sources.bags.bag import Bag, BagPlace, find_bags
 from hma_data.sources.bags.clocks import MAX_LATE_S, MessageTimes, apart
-from hma_data.sources.bags.container import Record, RecordFilter, damaged
+from hma_data.sources.bags.container import FOREVER, Record, RecordFilter, damaged
 from hma_data.sources.bags.images import image_kind
 from hma_data.sources.bags.inspect import report
 from hma_data.sources.bags.messages import decode
@@ -34,11 +34,6 @@ from hma_data.storage.paths import StrPath, as_text
 
 log = logging.getLogger(__name__)
 PART = re.compile(r"(?P<bag>.+)/(?P<number>[0-9]{4,9})")
-
-
-def open() -> "RosbagSource":
-    """Return the source of bags."""
-    return RosbagSource()
 
 
 class RosbagSource:
@@ -105,6 +100,9 @@ class RosbagSource:
             raise nothing_there(uri, path, "holds no bags", remedy)
         self._found[uri] = path, bags
         return path, bags
+
+
+open = RosbagSource
 
 
 @cache
@@ -274,11 +272,10 @@ class _EpisodeReading:
         return chain.from_iterable(parts)
 
     def _hear(self, log_ns: int, text: str) -> None:
-        """Keep the first instruction in words; of an episode inside a bag, the nearest to its beginning."""
-        if self._segment is None:
-            self._said = self._said or ((log_ns, text) if text else None)
-        elif text and log_ns <= self._segment.last_ns:
-            begins, before = self._segment.first_ns, self._said
+        """Keep the text that is said nearest to the beginning of the bag, or of the episode in it."""
+        begins, ends = (self._segment.first_ns, self._segment.last_ns) if self._segment else (0, FOREVER)
+        if text and log_ns <= ends:
+            before = self._said
             if before is None or abs(log_ns - begins) < abs(before[0] - begins):
                 self._said = log_ns, text
 
