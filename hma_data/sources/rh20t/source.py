@@ -161,14 +161,15 @@ class Scene:
             f"{table}/{name}" for name, value in first.items() if name != "timestamp" and _is_numeric(value)
         ]
 
-    def metadata(self) -> dict[str, Any]:
-        """Return the content of metadata.json; empty where there is none.
+    def success(self) -> bool | None:
+        """Return whether the task was done; None where metadata.json does not rate it.
 
         Raises:
-            EpisodeError: it is damaged.
+            EpisodeError: metadata.json is damaged.
         """
         path = self.folder / "metadata.json"
-        return _json(path) if path.exists() else {}
+        rating = _json(path).get("rating") if path.exists() else None
+        return rating >= SUCCESS_RATING if isinstance(rating, int) else None
 
     def task(self, field: str) -> str:
         """Return the task in words, from task_description.json in a folder above; empty without it."""
@@ -300,7 +301,6 @@ class Rh20tSource:
         scene = Scene(found[episode_id])
         streams = {camera.name: Film(scene, camera.key) for camera in embodiment.cameras}
         primary = embodiment.primary_camera.key
-        rating = scene.metadata().get("rating")
         return Episode(
             id=episode_id,
             streams={**streams},
@@ -308,7 +308,7 @@ class Rh20tSource:
             states=_signals(scene, embodiment.state, primary) if embodiment.state else (),
             rate_stamped=False,
             instruction=scene.task(embodiment.source.instruction or INSTRUCTION_FIELD),
-            success=rating >= SUCCESS_RATING if isinstance(rating, int) else None,
+            success=scene.success(),
             source=str(scene.folder),
             metadata={"flags": {"frames_missing": sum(film.lacking for film in streams.values())}},
         )

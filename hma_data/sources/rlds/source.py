@@ -326,19 +326,7 @@ def _inspect(folder: RldsFolder, refs: list[EpisodeRef], episodes: int) -> Inspe
     survey.made |= {"files", "rows"}  # a column of another length than the episode cannot be read
     for problem in folder.problems:
         survey.note(Finding("files", "warn", problem))
-    lengths, first = _survey(folder, [ref.id for ref in refs], episodes, survey)
-    if first is None:
-        found = survey.findings(())
-        why = next((one for one in reversed(found) if one.check == "files"), found[0])
-        raise SourceError(folder.uri, f"holds no readable episode: {why}", "copy its files again")
-    keys = [_key_info(first, key, survey) for key in folder.step_features]
-    return survey.inspection("rlds", folder.uri, keys, lengths, _facts(folder))
-
-
-def _survey(
-    folder: RldsFolder, names: list[str], episodes: int, survey: Survey
-) -> tuple[list[int], Steps | None]:
-    """Look into a sample of the episodes; return the lengths of those read, and the first of the sample."""
+    names = [ref.id for ref in refs]
     chosen = survey.sample(names, episodes)
     more = names[: 0 if folder.remote else COUNTED_EPISODES]
     lengths: dict[str, int] = {}
@@ -355,7 +343,20 @@ def _survey(
             first = first or steps
             if name in chosen:
                 survey.look(name, {key: partial(_series, steps, key, survey) for key in steps.features})
-    return [lengths[name] for name in names if name in lengths], first
+    if first is None:
+        found = survey.findings(())
+        why = next((one for one in reversed(found) if one.check == "files"), found[0])
+        raise SourceError(folder.uri, f"holds no readable episode: {why}", "copy its files again")
+    keys = [_key_info(first, key, survey) for key in folder.step_features]
+    splits = [f"{name} {sum(shard.count for shard in shards)}" for name, shards in folder.splits.items()]
+    facts = {
+        "dataset": folder.name,
+        "version": folder.version,
+        "splits": ", ".join(splits),
+        "episode keys": ", ".join(name for name in folder.features if not name.startswith("steps/")),
+    }
+    in_order = [lengths[name] for name in names if name in lengths]
+    return survey.inspection("rlds", folder.uri, keys, in_order, facts)
 
 
 def _series(steps: Steps, key: str, survey: Survey) -> Series:
@@ -373,13 +374,6 @@ def _series(steps: Steps, key: str, survey: Survey) -> Series:
         survey.note(Finding("padding", "info", said, key=key))
         values = values[:-1]
     return Series(numbers=lambda: values)
-
-
-def _facts(folder: RldsFolder) -> dict[str, str]:
-    splits = [f"{name} {sum(shard.count for shard in shards)}" for name, shards in folder.splits.items()]
-    outside = [name for name in folder.features if not name.startswith("steps/")]
-    found = {"dataset": folder.name, "version": folder.version}
-    return found | {"splits": ", ".join(splits), "episode keys": ", ".join(outside)}
 
 
 def _key_info(steps: Steps, key: str, survey: Survey) -> KeyInfo:
