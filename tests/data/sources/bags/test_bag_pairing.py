@@ -214,14 +214,6 @@ COUNT = 20
 SECOND = 10**9
 
 
-def test_messages_swapped_on_arrival_take_the_order_of_their_stamps() -> None:
-    times = np.arange(COUNT) * SECOND // 10
-    times[[4, 5]] = times[[5, 4]]
-    times[[10, 11, 12]] = times[[12, 10, 11]]
-    order = sorted_by(times, np.zeros(COUNT, np.int64))
-    assert order is not None and (np.diff(times[order]) > 0).all()
-
-
 @pytest.mark.parametrize("back_s", [0.75, 5, 3600])
 def test_a_clock_that_is_set_back_is_never_sorted(back_s: float) -> None:
     times = np.arange(40) * SECOND // 10

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
-from hma_data.errors import EpisodeError, MissingDependencyError, SourceError, StorageError
+from hma_data.errors import EpisodeError, MissingDependencyError, StorageError
 from hma_data.sources.base import Expecting, open_source
 from hma_data.sources.rlds import records
 from hma_data.sources.rlds.folder import open_folder
@@ -19,6 +19,7 @@ from hma_data.sources.rlds.records import RecordFraming, masked_crc, scan_tfreco
 from hma_data.storage import blocks
 from hma_data.storage import remote as store
 from tests.data import rlds_files
+from tests.data.hub_cache import as_snapshot
 from tests.data.rlds_files import tensor
 from tests.data.sources.rlds.test_rlds import record as recorded
 from tests.data.sources.rlds.test_rlds import toy, write
@@ -48,32 +49,22 @@ def number(folder: Path | str, name: str) -> float:
 
 
 def test_links_of_the_hub_cache_and_to_the_whole_folder_are_followed(tmp_path):
-    folder = dataset(tmp_path / "hub" / "snapshots" / "abc" / "toy", 4)
-    blobs = tmp_path / "hub" / "blobs"
-    blobs.mkdir()
-    for i, item in enumerate(list(folder.iterdir())):
-        item.rename(blobs / str(i))
-        item.symlink_to(blobs / str(i))
-    (tmp_path / "link").symlink_to(folder)
-    for place in (folder, tmp_path / "link"):
+    snapshot = as_snapshot(dataset(tmp_path / "toy", 4), tmp_path / "cache")
+    (tmp_path / "link").symlink_to(snapshot)
+    for place in (snapshot, tmp_path / "link"):
         assert number(place, "train/000003") == 3
 
 
 class Handler(SimpleHTTPRequestHandler):
-    """Files by range; `asked` are the ranges answered, `fail` answers 503 that many times."""
+    """Files by range; `asked` are the ranges answered."""
 
     asked: list[tuple[str, int]]
-    fail: list[int]
     ranges = True
 
     def log_message(self, *args):
         pass
 
     def do_GET(self):
-        if self.fail[0]:
-            self.fail[0] -= 1
-            self.send_error(503)
-            return
         path = Path(self.translate_path(self.path))
         if not path.is_file():
             self.send_error(404)
@@ -97,7 +88,6 @@ def served(tmp_path, monkeypatch):
 
     class Own(Handler):
         asked: list = []  # noqa: RUF012 - one for each test
-        fail = [0]  # noqa: RUF012
 
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Own, directory=str(tmp_path)))
     thread = threading.Thread(target=server.serve_forever, daemon=True)
@@ -144,22 +134,6 @@ def test_one_record_more_costs_no_pass_over_those_that_are_known():
     np.testing.assert_array_equal(found.offsets, np.arange(count + 1) * 20 + 12)
     assert (found.lengths[-1], found.checks[-1], found.whole) == (4, masked_crc(b"abcd"), False)
     assert peak < 40 * count  # bytes: copies of the arrays, and no list of their numbers
-
-
-def test_what_passes_by_itself_is_tried_again_and_what_does_not_is_one_error(served):
-    folder, uri, handler = served
-    dataset(folder / "d", 4)
-    open_folder(uri)
-    handler.fail[0] = 2
-    assert number(uri, "train/000002") == 2
-    handler.fail[0] = 1000
-    with pytest.raises(SourceError, match=r"cannot be read.*503.*network failed repeatedly"):
-        number(uri, "train/000003")
-    assert handler.fail[0] >= 1000 - 2 * (len(store.WAITS_S) + 1)
-    handler.fail[0] = 0
-    shard(folder / "d").unlink()
-    with pytest.raises(SourceError, match="cannot be read"):
-        number(uri, "train/000003")
 
 
 def test_a_server_without_ranges_is_named(served):
