@@ -109,9 +109,7 @@ def frame(item: dict, key: str) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "kind, frames", [("rlds", "all"), ("hdf5", "all"), ("bag", "all"), ("rlds", "strided")]
-)
+@pytest.mark.parametrize("kind, frames", [("hdf5", "all"), ("bag", "all"), ("rlds", "strided")])
 def test_lerobot_reads_what_the_shards_hold(kind: str, frames: str, tmp_path: Path) -> None:
     data, robot = RECORDINGS[kind](tmp_path)
     summary = to_lerobot(robot, data, tmp_path / "out", replace(SMALL, frames=frames))
