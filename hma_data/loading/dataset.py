@@ -28,6 +28,7 @@ from hma_data.loading.pools import UnitAssignment, WindowSequence, pool_size
 from hma_data.loading.rows import MIB, Batch, RowDecoder, as_batch, assemble
 from hma_data.loading.views import FIRST_CAMERA, Cameras, Views, by_number, view_count
 from hma_data.shards.reader import ShardSet
+from hma_data.shards.schema import joined
 from hma_data.shards.windows import Short
 from hma_data.storage.paths import StrPath
 
@@ -138,11 +139,9 @@ class WindowDataset(Dataset[Batch]):
             views = None if view is None else view[chosen]
             cuts.append(rows.cut(first[chosen] - edge, end, index, views))
             samples.append(chosen)
-        joined = {name: np.concatenate([cut[name] for cut in cuts]) for name in cuts[0]}
         order = np.concatenate(samples)
-        joined["camera"] = camera[order]
         name = self.shards.embodiment.id
-        cut = {name: (order, joined)}
+        cut = {name: (order, joined(cuts) | {"camera": camera[order]})}
         return next(assemble(self.shards.spec, [name] * len(numbers), cut, self._short, self._views))
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from hma_data.arrays import Array, Ints
 from hma_data.loading.rows import RowDecoder, Rows
+from hma_data.shards.schema import joined
 from hma_data.shards.windows import WindowIndex
 
 UNITS = 8  # at least so many per reader: with fewer units, shares are less equal
@@ -141,9 +142,7 @@ class WindowSequence:
             cut["camera"] = self._camera[chosen]
             cuts.append(cut)
             start, count = start + some, count - some
-        if len(cuts) == 1:
-            return cuts[0]
-        return {key: np.concatenate([cut[key] for cut in cuts]) for key in cuts[0]}
+        return joined(cuts)
 
     def _rounds(self, epoch: int) -> tuple[Ints, Ints]:
         """Return the order of the units in an epoch, and the number of windows up to the end of each pool."""

@@ -26,7 +26,7 @@ import pyarrow.parquet as pq
 from hma_data.arrays import Array, Ints
 from hma_data.errors import ShardError, UsageError
 from hma_data.shards.manifest import EPISODES, QUARANTINE, Manifest, ShardFile, restat_remedy
-from hma_data.shards.schema import flag_pauses, mask_columns, to_numpy, token_column
+from hma_data.shards.schema import flag_pauses, joined, mask_columns, to_numpy, token_column
 from hma_data.storage.files import cache_folder, file_sha256, parse_json, part_of
 from hma_data.storage.paths import StrPath
 from hma_data.storage.remote import RemotePath, parquet_file, place, remote_file
@@ -256,9 +256,7 @@ class EpisodeReader:
             begin, end = (int(np.clip(at - edges[group], 0, None)) for at in (row_start, row_start + rows))
             values = self._group(shard, group)
             parts.append({name: values[name][begin:end] for name in self._columns})
-        if len(parts) == 1:
-            return parts[0]
-        return {name: np.concatenate([part[name] for part in parts]) for name in self._columns}
+        return joined(parts)
 
 
 def _pauses(flags: Ints, words: Sequence[str], frame_stride: int) -> Ints:

@@ -372,6 +372,13 @@ def _flat(array: pa.Array) -> Array:
     return np.from_dlpack(array)
 
 
+def joined(parts: Sequence[dict[str, Array]]) -> dict[str, Array]:
+    """Return columns of rows that follow one another as one; a single part is not copied."""
+    if len(parts) == 1:
+        return parts[0]
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
 def read_metadata(path: Path) -> pq.FileMetaData:
     """Return the metadata of a shard's file."""
     try:
