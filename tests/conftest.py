@@ -18,7 +18,7 @@ from hypothesis import HealthCheck, settings
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
 from hma_data.cpu import take_ordinary_priority
-from hma_data.registry.embodiment import Embodiment
+from hma_data.registry.embodiment import Embodiment, judged
 from hma_data.tokenizers.base import TokenizerSpec, check_frames, check_tokens
 
 # The same few examples in every run, so that a red main means the change; HMA_FUZZ=1 draws many new ones.
@@ -240,6 +240,11 @@ def contents(folder: Path) -> dict[str, bytes]:
     """Return the bytes of every file in a folder, by path."""
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+
+
+def problems(values: Any) -> list[str]:
+    """Return all problems of a YAML's plain values, one line each."""
+    return [str(problem) for problem in judged(values)[1]]
 
 
 def write_toy(path: Path, lengths: Iterable[int]) -> None:

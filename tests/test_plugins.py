@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 
 from hma_data.errors import PluginError, SourceError, TokenizerError
-from hma_data.registry.embodiment import problems
 from hma_data.sources.base import open_source
 from hma_data.sources.detect import detect
 from hma_data.tokenizers.base import get_tokenizer
 from tests.command import ROOT, fails, hma
-from tests.conftest import write_toy
+from tests.conftest import problems, write_toy
 
 PAGE = (ROOT / "docs/extending.md").read_text()
 FILES = dict(re.findall(r"^```\w+\n# (\S+)\n(.*?)^```", PAGE, re.M | re.S))

@@ -291,11 +291,6 @@ class Embodiment(SpecModel):
         return robot
 
 
-def problems(values: Any) -> list[str]:
-    """Return all problems of a YAML's plain values, one line each; empty when it is valid."""
-    return [str(problem) for problem in judged(values)[1]]
-
-
 def judged(values: Any) -> tuple[Embodiment | None, list[Problem]]:
     """Return the embodiment of a YAML's plain values, or None and all problems."""
     if not isinstance(values, dict):

@@ -13,9 +13,10 @@ from rosbags.typesys import Stores, get_typestore
 from hma_data.episodes.align import to_clip
 from hma_data.episodes.episode import Clip
 from hma_data.inspection.infer import infer
-from hma_data.registry.embodiment import TODO, Embodiment, problems, todos
+from hma_data.registry.embodiment import TODO, Embodiment, todos
 from hma_data.sources.base import open_source
 from hma_data.storage.yaml_io import parse_yaml
+from tests.conftest import problems
 from tests.data.bag_files import START_NS
 from tests.data.rlds_files import png
 

@@ -15,10 +15,10 @@ from hma_data.conversion.report import Summary
 from hma_data.episodes.images import PictureCheck, resize
 from hma_data.errors import SourceError
 from hma_data.inspection.inspect import examine
-from hma_data.registry.embodiment import Embodiment, problems
+from hma_data.registry.embodiment import Embodiment
 from hma_data.shards.reader import ShardSet
 from tests.command import hma
-from tests.conftest import ARM_YAML
+from tests.conftest import ARM_YAML, problems
 from tests.data import bag_files, videos
 from tests.data.sources.lerobot.test_lerobot import embodiment as lerobot_arm
 

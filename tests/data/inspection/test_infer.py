@@ -19,12 +19,13 @@ from hypothesis import strategies as st
 from hma_data.episodes.align import to_clip
 from hma_data.errors import HMAError, SourceError, UsageError
 from hma_data.inspection.infer import from_inspection, infer
-from hma_data.registry.embodiment import Embodiment, find, problems
+from hma_data.registry.embodiment import Embodiment, find
 from hma_data.sources.base import open_source
 from hma_data.sources.common.checks import seconds_a_unit
 from hma_data.sources.common.inspection import Inspection, KeyInfo, TopicInfo
 from hma_data.storage.yaml_io import parse_yaml
 from tests.command import ROOT, hma
+from tests.conftest import problems
 from tests.data import rlds_files
 from tests.data.inferring import H, T, W, answered, first_clip, inferred, keys, numbers, pictures, questions
 from tests.data.rlds_files import TEXT, features_dict, image, png, tensor

@@ -12,9 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hma_data.errors import RegistryError
-from hma_data.registry.embodiment import Embodiment, find, problems, schema, todos
+from hma_data.registry.embodiment import Embodiment, find, schema, todos
 from hma_data.registry.folders import registry_files
 from hma_data.storage.yaml_io import MAX_BYTES, parse_yaml, read_yaml, write_yaml
+from tests.conftest import problems
 
 BASE: dict[str, Any] = {
     "id": "arm",
