@@ -176,12 +176,6 @@ STEADY = np.arange(20) * 0.1
 FAST = np.arange(200) * 0.01
 
 
-def test_a_command_sent_between_two_frames_acts_from_the_second_on() -> None:
-    clip = to_clip(episode(STEADY, STEADY, np.array([0.0, 0.55]), STEADY, STEADY), embodiment())
-    values = clip.episode.actions[0].values[:, 0]
-    np.testing.assert_array_equal(clip.actions[:, 0], np.where(STEADY >= 0.55, values[1], values[0]))
-
-
 def test_a_command_within_the_tolerance_acts_at_the_frame_before_it_and_states_do_not_change() -> None:
     late = STEADY + 0.03
     run = episode(STEADY, STEADY, late, STEADY, late)
@@ -192,12 +186,6 @@ def test_a_command_within_the_tolerance_acts_at_the_frame_before_it_and_states_d
     assert clip.skew_ms["a"].max() == pytest.approx(30) and clip.skew_ms["s"].max() == pytest.approx(70)
     with pytest.raises(RegistryError, match="tolerance_ms is for actions: hold, not for nearest"):
         embodiment(tolerance_ms=30, actions="nearest")
-
-
-def test_frames_before_the_first_command_are_left_out_and_counted() -> None:
-    clip = to_clip(episode(STEADY, STEADY, STEADY[5:], STEADY, STEADY), embodiment())
-    assert (len(clip), clip.trimmed) == (15, 5)
-    assert clip.frames_at("front", np.arange(1))[0, 0, 0, 0] == 5
 
 
 @given(limit=st.floats(1, 80), gap=st.integers(1, 12))

@@ -1,7 +1,5 @@
 """`area` is OpenCV's INTER_AREA bit for bit, also where it is computed by exact sums."""
 
-from fractions import Fraction
-
 import cv2
 import numpy as np
 import pytest
@@ -55,21 +53,3 @@ def test_sums_are_left_where_a_mean_may_be_half_a_level_or_opencv_less_exact() -
     assert not images._takes_sums(768, 768, 256, 256)  # OpenCV is fast at whole ratios
     assert not images._takes_sums(240, 240, 256, 256)
     assert not images._takes_sums(84, 84, 64, 64)  # small
-
-
-def test_a_mean_is_the_exact_one_rounded() -> None:
-    frame = pictures(480, 480)[:1]
-    made = resize(frame, 256)[0]
-    for row, column in ((0, 0), (17, 101), (255, 255)):
-        mean, scale = Fraction(0), Fraction(480, 256)
-        for y, height in covered(row, scale):
-            for x, width in covered(column, scale):
-                mean += height * width * int(frame[0, y, x, 1])
-        assert made[row, column, 1] == round(mean / scale**2)
-
-
-def covered(index: int, scale: Fraction) -> list[tuple[int, Fraction]]:
-    """Return (input, the part of it that an output covers)."""
-    start, stop = index * scale, (index + 1) * scale
-    parts = [(i, min(stop, Fraction(i + 1)) - max(start, Fraction(i))) for i in range(480)]
-    return [(i, part) for i, part in parts if part > 0]

@@ -12,7 +12,7 @@ from hma_data.episodes.align import to_clip
 from hma_data.episodes.episode import Clip
 from hma_data.episodes.images import prepare
 from hma_data.errors import UsageError
-from hma_data.lab import pendulum, planar_arm, record, simulator, truth
+from hma_data.lab import planar_arm, record, simulator, truth
 from hma_data.lab.family.look import SIZE as LAB_SIZE
 from hma_data.lab.simulator import SIZE, LabSimulator, simulated
 from hma_data.registry.embodiment import Embodiment
@@ -137,11 +137,6 @@ def test_episodes_are_repeatable_and_of_any_length(robot: str) -> None:
     assert long.pictures.shape[:2] == (30, long.pictures.shape[2]) and 1 <= long.driven <= long.parts.shape[1]
     moved = np.ptp(long.parts[:, : long.driven], axis=0).max()
     assert 4 < moved < LAB_SIZE
-
-
-def test_an_episode_is_longer_than_a_recording() -> None:
-    smooth = 1  # of the pendulum's drivers; its torques are a function of time
-    assert len(truth.episode("pendulum", 60, 2, 0, smooth).parts) * 2 > pendulum.STEPS
 
 
 def test_parts_are_where_their_colours_are() -> None:

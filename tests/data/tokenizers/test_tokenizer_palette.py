@@ -136,12 +136,6 @@ def test_colours_of_a_spec_open_no_file_and_are_never_too_many(name, colors, tmp
         assert reopened(spec).spec == get_spec("fsq-16")
 
 
-def test_a_file_whose_name_could_be_colours_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write(tmp_path / "decade", OWN)
-    monkeypatch.chdir(tmp_path)
-    assert get_tokenizer("palette-64", weights="decade").spec.factored == (3,) * 4
-
-
 def test_colours_are_read_from_the_json_of_a_model_or_a_set(tmp_path: Path) -> None:
     write(tmp_path / "own.safetensors", OWN)
     own, path = get_spec("palette-64", weights=tmp_path / "own.safetensors"), tmp_path / "config.json"
