@@ -14,7 +14,7 @@ R rows of a table, one a hand.
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -224,9 +224,14 @@ def _boxes_of(path: Path, layout: HandsLayout) -> HandLabels:
     except Exception as fault:  # damaged bytes make pickle and protobuf raise a dozen different types
         remedy = "fetch the file again, or write its hands as a table and set labels: landmarks"
         raise EpisodeError(path, f"cannot be read as a list of messages: {fault}", remedy) from fault
+    return _of_centers(rows, looked_at)
+
+
+def _of_centers(rows: Sequence[tuple[float, ...]], looked_at: list[int], **facts: Any) -> HandLabels:
+    """Make labels of rows (frame, side, score, x, y); see `labels_from_rows`."""
     table = np.array(rows, np.float64).reshape(-1, 5)
     frames, sides = table[:, :2].astype(np.int64).T
-    return labels_from_rows(frames, sides, table[:, 2], {"center": table[:, 3:]}, looked_at)
+    return labels_from_rows(frames, sides, table[:, 2], {"center": table[:, 3:]}, looked_at, **facts)
 
 
 # the fields of EPIC-KITCHENS' types.proto that are read
@@ -293,13 +298,10 @@ def _labels_of_actions(actions: list[Any], layout: HandsLayout) -> HandLabels | 
         texts.append((min(numbers), text))
         for number, (_, boxes) in zip(numbers, frames, strict=True):
             for kind, x, y, width, height in boxes:
-                rows.append((number, kind == "right_hand", x + width / 2, y + height / 2))
+                rows.append((number, kind == "right_hand", 1.0, x + width / 2, y + height / 2))
     if not rows:
         return None
-    table = np.array(rows, np.float64)
-    frames, sides = table[:, :2].astype(np.int64).T
-    facts = {"pixels": True, "irregular": True, "texts": tuple(sorted(texts))}
-    return labels_from_rows(frames, sides, np.ones(len(table)), {"center": table[:, 2:]}, looked_at, **facts)
+    return _of_centers(rows, looked_at, pixels=True, irregular=True, texts=tuple(sorted(texts)))
 
 
 # -- Ego-Exo4D
