@@ -5,6 +5,7 @@ import os
 import shutil
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import cv2
 import h5py
@@ -287,15 +288,9 @@ def test_indexing_opens_each_of_many_files_once(tmp_path: Path, monkeypatch: pyt
     for i in range(2 * OPEN_FILES):
         with h5py.File(tmp_path / f"episode_{i}.h5", "w") as file:
             fill(file)
-    opened: list[Path] = []
-    plain = hdf5_file._open
-
-    def counted(path: Path) -> h5py.File:
-        opened.append(path)
-        return plain(path)
-
-    monkeypatch.setattr(hdf5_file, "_open", counted)
-    assert len(open_source("hdf5").index(str(tmp_path))) == len(opened) == 2 * OPEN_FILES
+    opened = Mock(wraps=hdf5_file._open)
+    monkeypatch.setattr(hdf5_file, "_open", opened)
+    assert len(open_source("hdf5").index(str(tmp_path))) == opened.call_count == 2 * OPEN_FILES
 
 
 def test_an_unknown_episode_is_a_source_error(demos: Path) -> None:
