@@ -13,7 +13,7 @@ from hma_data.tables import Table
 from hma_model.benchmark.planning import difference
 from hma_model.evaluation.agreement import Estimate
 from hma_model.evaluation.intervals import ends_of, interval
-from hma_model.evaluation.pages import Page
+from hma_model.evaluation.pages import Page, as_sentence
 from hma_model.evaluation.plots import COLOURS, MARKERS, label_axes, svg_bytes
 from hma_model.evaluation.tables import value
 
@@ -144,9 +144,8 @@ def _calibration(page: Page, found: dict[str, Any]) -> None:
     if "missing" in found:
         page.text(f"Uncertainty is not calibrated: {found['missing']}.")
         return
-    verdict = found["meter"]["verdict"]
     page.text(
-        f"{verdict[:1].upper()}{verdict[1:]}. In time: by the frame at which the state error reaches "
+        f"{as_sentence(found['meter']['verdict'])} In time: by the frame at which the state error reaches "
         f"{found['doubled_px']:.2f} px, twice that of first frames, at most {found['lead_frames']} frames "
         "before. A clock warns all rollouts at the same frame, the best one. The scenes of a rate are not "
         "those that its limit was fitted on."

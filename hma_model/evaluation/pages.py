@@ -77,5 +77,10 @@ class Page:
         self._blocks.append({"kind": kind, **values})
 
 
+def as_sentence(words: str) -> str:
+    """Return words with a capital and a full stop."""
+    return f"{words[:1].upper()}{words[1:]}."
+
+
 def _data_uri(data: bytes, kind: str) -> str:
     return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"

@@ -29,7 +29,7 @@ from hma_data.storage.locks import locked
 from hma_data.storage.paths import StrPath, as_path
 from hma_model.arrays import evenly
 from hma_model.evaluation.agreement import alike_pairs, share_interval
-from hma_model.evaluation.pages import Page
+from hma_model.evaluation.pages import Page, as_sentence
 from hma_model.generation.decode import cameras_for
 from hma_model.policies.arenas import Beginning, ModelArena, Scenes
 from hma_model.policies.base import Policy, begin, checked
@@ -259,7 +259,7 @@ def html(found: ModelEvaluation) -> str:
     page = Page("Policies inside the world model", lead)
     page.table(COLUMNS, found.table())
     for sentence in found.sentences():
-        page.text(sentence[:1].upper() + sentence[1:] + ".")
+        page.text(as_sentence(sentence))
     for one in found.policies:
         page.section(one.policy)
         for outcome, word in ((True, "success"), (False, "failure")):

@@ -13,7 +13,7 @@ from hma_data.episodes.sheets import grid, png_bytes
 from hma_data.storage.files import write_atomic
 from hma_data.storage.kept import remove_kept
 from hma_model.evaluation.agreement import Estimate
-from hma_model.evaluation.pages import Page
+from hma_model.evaluation.pages import Page, as_sentence
 from hma_model.evaluation.plots import COLOURS, MARKERS, labelled_axes, svg_bytes
 from hma_model.policies.scores import MODEL, SHARED, TRUE, WORK, Abstention, PolicyEvaluation, Scored
 
@@ -170,8 +170,7 @@ def html(found: PolicyEvaluation) -> str:
         ]
     page.figures([(_value(one), f"{words}{_ends(one)}") for one, words in figures])
     if found.refusal:  # before anybody reads the rates
-        sentence = refused(found)
-        page.section("Do not rely on the model's rates", sentence[:1].upper() + sentence[1:] + ".")
+        page.section("Do not rely on the model's rates", as_sentence(refused(found)))
     page.definitions(legend)
     # An interval below its value leaves room for the last columns.
     rows = []
@@ -180,7 +179,7 @@ def html(found: PolicyEvaluation) -> str:
     page.table(COLUMNS, rows)
     for sentence in sentences(found):
         if sentence != refused(found):
-            page.text(sentence[:1].upper() + sentence[1:] + ".")
+            page.text(as_sentence(sentence))
     page.section("Success rates", "A policy is a point; bars are 95 % intervals over episodes.")
     page.picture(_plot(found), "svg+xml", "Success in the simulator and in the model")
     for kind, title in OUTCOME_TITLES.items():
