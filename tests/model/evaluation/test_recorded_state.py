@@ -12,7 +12,7 @@ import torch
 
 from hma_data.conversion.job import convert
 from hma_data.conversion.plan import Settings
-from hma_data.lab import pusht, truth
+from hma_data.lab import truth
 from hma_data.lab.family.look import SIZE
 from hma_data.lab.simulator import LabSimulator
 from hma_data.registry.embodiment import Embodiment
@@ -229,14 +229,6 @@ def test_places_are_read_to_a_pixel_or_two_off_other_pictures(probe):
     assert list(probe.own) == [0, 1] and list(replace(probe, driven=1).loose) == [1]
 
 
-def test_an_error_is_the_distance_from_the_true_place(probe):
-    pictures, parts = scenes(8, 2)
-    moved = parts.reshape(2, 4, 2, 2) + np.array([30, 40])
-    errors = state_errors(probe, pictures.reshape(2, 4, *pictures.shape[1:]), moved)
-    assert errors.shape == (2, 4, 2)
-    assert errors.mean() == pytest.approx(50, abs=3)
-
-
 def test_what_does_not_move_or_cannot_be_read_is_no_part_of_the_state(monkeypatch):
     pictures, parts = scenes(100, 3)
     parts[:, 0] = (20, 30)  # as of a disc that stands still
@@ -261,12 +253,11 @@ def test_the_same_seed_gives_the_same_probe(monkeypatch):
 
 
 @pytest.mark.parametrize("robot", truth.PUSHERS)
-@pytest.mark.parametrize("seed", [0, 1])
-def test_the_tee_of_a_picture_is_found_to_a_pixel(robot: str, seed: int) -> None:
+def test_the_tee_of_a_picture_is_found_to_a_pixel(robot: str) -> None:
     finder, simulator = TeeFinder.of(robot), LabSimulator(robot)
     assert finder is not None
     for number in range(12):
-        simulator.reset(seed, number)
+        simulator.reset(0, number)
         picture = simulator.picture().astype(np.float64)
         _, parts = truth.parts_of(simulator.simulation)
         x, y = (finder.within(parts[None])[0, 1] * len(picture) / truth.SIZE).astype(int)
@@ -282,17 +273,3 @@ def test_a_tee_of_few_pixels_is_not_found() -> None:
     assert finder.find(pixels) is None
     pixels[20:24, 20:26] = True
     assert finder.find(pixels) is None
-
-
-def test_the_middles_of_the_bars_lie_within_the_tee() -> None:
-    finder = TeeFinder.of("pusht_slow")
-    assert finder is not None
-    simulator = LabSimulator("pusht_slow")
-    simulator.reset(3, 2)
-    _, parts = truth.parts_of(simulator.simulation)
-    (within,) = finder.within(parts[None])
-    np.testing.assert_allclose(within[0], parts[0])
-    pose = pusht.tee_pose(parts[1:])
-    arena = within[1:] / pusht.PX - pose[:2]
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    assert (pusht.tee().distance(arena @ np.array([[c, -s], [s, c]])) < -10).all()

@@ -76,9 +76,7 @@ def test_a_split_without_such_a_window_is_refused_with_what_to_do(shards: ShardS
             rollout_video(make_model({"arm": 2}), Blocks(), given, **options)
 
 
-def test_a_folder_of_sheets_is_listed_once_for_all_its_robots(tmp_path: Path, monkeypatch) -> None:
-    glob, patterns = Path.glob, []
-    monkeypatch.setattr(Path, "glob", lambda path, pattern: patterns.append(pattern) or glob(path, pattern))
+def test_the_newest_sheet_of_each_robot_is_found(tmp_path: Path) -> None:
     (tmp_path / module.SHEETS).mkdir()
     for name, steps in (("arm", (2, 10)), ("big-arm", (2,)), ("hand", (10, 200))):
         for step in steps:
@@ -89,7 +87,6 @@ def test_a_folder_of_sheets_is_listed_once_for_all_its_robots(tmp_path: Path, mo
         "big-arm": "step-00000002-big-arm.png",
         "hand": "step-00000200-hand.png",
     }
-    assert len(patterns) == 1
 
 
 def test_the_verb_tells_of_actions_outside_the_range_seen_in_training(shards, tmp_path, monkeypatch, capsys):

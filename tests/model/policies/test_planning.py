@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from hma_data.errors import HMAError, UsageError
+from hma_data.errors import UsageError
 from hma_data.tokenizers.base import get_tokenizer
 from hma_model.policies.arenas import Scenes, TrueArena
 from hma_model.policies.base import begin, checked
@@ -35,12 +35,6 @@ def test_imagined_images_are_those_of_sessions_that_take_the_actions() -> None:
             for ahead in range(2):
                 made = world.step({session: actions[scene, candidate, ahead]})[session]
                 np.testing.assert_array_equal(images[scene, candidate, ahead], made)
-
-
-def test_a_robot_that_the_model_lacks_is_named() -> None:
-    world = World(tiny_model(ROBOT), get_tokenizer("fsq-8"), unmask_steps=1, temperature=0.0)
-    with pytest.raises(HMAError, match="nope_01"):
-        Cost(world, "nope_01")
 
 
 class DotWorld:
