@@ -17,7 +17,7 @@ from hma_data.lab.truth import episode
 from hma_data.registry.embodiment import find
 from hma_model.checkpoint.folder import Checkpoint
 from hma_model.cli import main
-from hma_model.evaluation import report, suite
+from hma_model.evaluation import probe, report, suite
 from hma_model.evaluation.report import difference, write_results
 from hma_model.evaluation.simulated import PERTURBATION, perturbed
 from hma_model.evaluation.suite import EvaluationSettings, Part, evaluate_all
@@ -275,11 +275,12 @@ def test_recorded_pictures_are_of_the_camera_that_the_window_takes(cameras: str,
 
 
 @pytest.mark.slow
-def test_the_state_of_a_laboratory_robot_is_read_beside_the_probes_error() -> None:
+def test_the_state_of_a_laboratory_robot_is_read_beside_the_probes_error(monkeypatch) -> None:
     from hma_data.tokenizers.base import get_tokenizer
     from hma_model.evaluation.simulated import measure_state
     from hma_model.network.model import HMA
 
+    monkeypatch.setattr(probe, "EPISODES", 16)
     robot = "rails_03"
     model = HMA.from_pretrained("embedded", embodiments=[robot]).eval()
     tokenizer = get_tokenizer(str(model.config.tokenizer["name"]))

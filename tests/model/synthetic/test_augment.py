@@ -20,6 +20,7 @@ from hma_data.shards.reader import EpisodeReader, ShardSet
 from hma_data.shards.schema import flag_counts, read_footer
 from hma_data.shards.verify import verify
 from hma_data.sources.base import open_source
+from hma_model.evaluation import probe
 from hma_model.evaluation.calibration import Meter
 from hma_model.policies.acting import Acting
 from hma_model.policies.arenas import Scenes, TrueArena
@@ -403,7 +404,7 @@ def test_lerobot_loads_the_dataset(world: World, tmp_path: Path, monkeypatch: py
 
 
 @pytest.mark.slow
-def test_a_policy_of_lerobot_trains_on_the_dataset_with_the_state_in_its_images(tmp_path: Path) -> None:
+def test_a_policy_of_lerobot_trains_on_the_dataset_with_the_state_in_its_images(tmp_path, monkeypatch):
     import torch
     from lerobot.configs.types import FeatureType
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -412,6 +413,7 @@ def test_a_policy_of_lerobot_trains_on_the_dataset_with_the_state_in_its_images(
     from lerobot.policies.factory import make_pre_post_processors
     from lerobot.utils.feature_utils import dataset_to_policy_features
 
+    monkeypatch.setattr(probe, "EPISODES", 16)
     world = load_world("embedded")
     augment(tmp_path / "out", asked(), world=world, lerobot=tmp_path / "rails")
     robot = Embodiment.load(tmp_path / "rails" / "embodiment.yaml")
