@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 Saved = Annotated[Path, Argument(help="A checkpoint, or a run's folder.")]
 Revision = Annotated[str | None, Option(help="Branch, tag or commit.")]
 Private = Annotated[bool, Option("--private", help="Create new repositories as private.")]
+LONGEST = 1000  # letters that are shown of what strangers may have written
 hub_app = typer.Typer(no_args_is_help=True, help="Publish and pull checkpoints, one robot at a time.")
 
 
@@ -73,7 +74,7 @@ def push(
     for name, card in opened.cards(embodiment).items():
         judged = card.get("evaluation")
         if value_of(judged, "follows") is False:
-            say(f"{name} {_cell(value_of(judged, 'verdict'), 400)}; the model card starts with this verdict")
+            say(f"{name} {value_of(judged, 'verdict')}; the model card starts with this verdict")
     robots = "".join(f" -e {shlex.quote(name)}" for name in embodiment or ())
     say(f"fetch it: hma hub pull {shlex.quote(target)}{robots} --out {shlex.quote(named + '-pulled')}")
 
@@ -132,7 +133,7 @@ def listing(
             [*(_cell(row[key]) for key in columns), _megabytes(row["bytes"]), _state(row)]
             for row in facts["embodiments"]
         ]
-        say(_summary(facts))
+        say(_summary(facts)[:LONGEST])
         shown = [i for i in range(len(columns) + 2) if i == 0 or any(row[i] is not None for row in rows)]
         if rows:
             names = [*columns, "MB", "state"]
@@ -217,15 +218,15 @@ def _summary(facts: dict[str, Any]) -> str:
     model, tokenizer = (facts[key] if isinstance(facts[key], dict) else {} for key in ("model", "tokenizer"))
     parts = [facts["format"]]
     if facts["origin"]:
-        parts.append(_cell(facts["origin"]))
+        parts.append(facts["origin"])
     if model:
-        parts.append(f"{_cell(model.get('layers'))} layers, width {_cell(model.get('width'))}")
+        parts.append(f"{model.get('layers')} layers, width {model.get('width')}")
     if tokenizer:
-        parts.append(f"tokenizer {_cell(tokenizer.get('name'))}")
+        parts.append(f"tokenizer {tokenizer.get('name')}")
     sha256, size = facts["trunk_sha256"], _megabytes(facts["trunk_bytes"])
-    trunk = f"trunk {_cell(sha256)[:12]}" if isinstance(sha256, str) else "weights"
+    trunk = f"trunk {sha256[:12]}" if isinstance(sha256, str) else "weights"
     parts.append(f"{trunk}, {size} MB")
-    return f"{_cell(facts['checkpoint'], 1000)}: {'; '.join(parts)}; {_state(facts)}"
+    return f"{facts['checkpoint']}: {'; '.join(parts)}; {_state(facts)}"
 
 
 def _megabytes(size: int) -> float:
@@ -233,9 +234,9 @@ def _megabytes(size: int) -> float:
 
 
 def _state(facts: dict[str, Any]) -> str:
-    return _cell("; ".join(facts["problems"]), 400) or "usable here"
+    return "; ".join(facts["problems"])[:LONGEST] or "usable here"
 
 
-def _cell(value: Any, most: int = 80) -> Any:
+def _cell(value: Any) -> Any:
     """Return an untrusted value as it is shown: a number, or text that is not too long."""
-    return value if value is None or isinstance(value, int | float) else str(value)[:most]
+    return value if value is None or isinstance(value, int | float) else str(value)[:80]
