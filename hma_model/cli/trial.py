@@ -10,7 +10,6 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
@@ -148,10 +147,10 @@ def _answer(data: str, path: Path, given: list[str]) -> None:
         _set(values, key, parse_yaml(text, f"{key}={text}", UsageError))
     open_questions = []
     for key, question in todos(values):
-        whole_image = key == "provenance.crop" and sys.stdin.isatty() and _denied(question)
-        for camera in values["cameras"] if whole_image else ():
-            camera.pop("crop", None)
-            camera.pop("resize", None)
+        if key == "provenance.crop" and sys.stdin.isatty() and input(f"{question} [Y/n] ")[:1] in ("n", "N"):
+            for camera in values["cameras"]:  # the whole image
+                camera.pop("crop", None)
+                camera.pop("resize", None)
         if key == "robot" or key.startswith("provenance"):
             _set(values, key, "not stated")  # a text for people, which changes nothing
         elif sys.stdin.isatty():
@@ -168,24 +167,16 @@ def _answer(data: str, path: Path, given: list[str]) -> None:
     write_atomic(path, write_yaml(values))
 
 
-def _denied(question: str) -> bool:
-    return input(f"{question} [Y/n] ").strip().lower().startswith("n")
-
-
 def _set(values: Any, key: str, value: Any) -> None:
     """Set the value at a path such as `cameras[0].color`."""
-    *parents, last = _parts(key)
+    words = re.findall(r"([^.\[\]]+)|\[(\d+)\]", key)
+    *parents, last = (word or int(number) for word, number in words)
     try:
         for part in parents:
             values = values[part]
         values[last] = value
     except (KeyError, IndexError, TypeError) as fault:
         raise UsageError("--answer", f"{key} is not a key of the YAML", "see the keys in the file") from fault
-
-
-def _parts(key: str) -> Iterator[str | int]:
-    for word, number in re.findall(r"([^.\[\]]+)|\[(\d+)\]", key):
-        yield word or int(number)
 
 
 def _write_page(folder: Path, shards: Path, film: Path, done: list[list[str]]) -> Path:

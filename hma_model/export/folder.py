@@ -157,9 +157,7 @@ def _written(out: Path) -> Iterator[Path]:
 
 
 def _require_own(out: Path) -> None:
-    if not out.exists():
-        return
-    if out.is_dir() and not any(out.iterdir()):
+    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return
     if not (out / MANIFEST).is_file() or read_json(out / MANIFEST).get("format") != FORMAT:
         raise OutputError(out, "holds something else than an export", "choose another --out")
