@@ -171,7 +171,7 @@ def comparison(parts: Sequence[Part], intervals: bool = True) -> Table:
         label = average["checkpoint"]
         own = [part.found for part in parts if part.checkpoint == label]
         for found in [*own, average] if len(own) > 1 else own:
-            cells = [_cell(*_estimate(found, figure, intervals), figure.digits) for figure in figures]
+            cells = [_cell(found, figure, intervals) for figure in figures]
             rows.append([label, found["embodiment"], found["windows"], found["episodes"], *cells])
     return Table(["checkpoint", "robot", "windows", "episodes", *(figure.name for figure in figures)], rows)
 
@@ -188,20 +188,15 @@ def turned(parts: Sequence[Part]) -> Table:
     return Table(["figure", *heads], rows)
 
 
-def _estimate(
-    found: Mapping[str, Any], figure: Figure, intervals: bool = True
-) -> tuple[float | None, Sequence[float] | None]:
-    return value(found, figure.path), value(found, f"{figure.path}_95") if intervals else None
-
-
 def _interval_below(cell: Any) -> Any:
     return cell.replace(" [", "\n", 1).rstrip("]").replace(", ", " to ") if isinstance(cell, str) else cell
 
 
-def _cell(figure: float | None, ends: Sequence[float] | None, digits: int) -> str | Decimal | None:
-    if figure is None or not ends:
-        return _digits(figure, digits)
-    return f"{figure:.{digits}f} [{ends[0]:.{digits}f}, {ends[1]:.{digits}f}]"
+def _cell(found: Mapping[str, Any], figure: Figure, intervals: bool) -> str | Decimal | None:
+    number, ends, digits = value(found, figure.path), value(found, f"{figure.path}_95"), figure.digits
+    if number is None or not ends or not intervals:
+        return _digits(number, digits)
+    return f"{number:.{digits}f} [{ends[0]:.{digits}f}, {ends[1]:.{digits}f}]"
 
 
 def _digits(figure: float | None, digits: int) -> Decimal | None:
@@ -270,8 +265,8 @@ def single(part: Part) -> Table:
     """Return the figures of one part, with what they mean."""
     rows = []
     for figure in present([part]):
-        number, ends = _estimate(part.found, figure)
-        rows.append([figure.name, _digits(number, figure.digits), _ends(ends), figure.meaning])
+        number, ends = _cell(part.found, figure, False), value(part.found, f"{figure.path}_95")
+        rows.append([figure.name, number, _ends(ends), figure.meaning])
     return Table(["figure", "value", "95 %", "meaning"], rows)
 
 
