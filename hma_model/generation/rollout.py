@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from hma_data.errors import HMAError
@@ -28,7 +29,7 @@ from hma_model.generation.engine import Engine
 from hma_model.generation.passes import Passes
 from hma_model.generation.state import RowState, Snapshot
 from hma_model.generation.unmask import Decoding, PatchFrame, TokenFrame, masked_after
-from hma_model.network.conditioning import ActionConditioning, Groups, unknown
+from hma_model.network.conditioning import ActionConditioning, Groups, align, unknown
 from hma_model.network.copying import known_digits
 from hma_model.network.network import Network
 from hma_model.network.stem import split_tokens, unpatchify
@@ -367,21 +368,18 @@ def _prompt_chunks(
     Raises:
         HMAError: the shapes are others.
     """
-    batch, width, device = len(names), model.widest_chunk(names), model.device
-    given = unknown(batch, frames, width, device)
-    if actions is None or frames == 1:
-        return given
-    if actions.shape[0] != batch or actions.shape[1] < frames - 1 or actions.shape[2] < width:
-        fault = f"actions have the shape {tuple(actions.shape)} for a prompt of {frames} frames"
-        raise HMAError("prompt", fault, f"give ({batch}, {frames - 1} or more, {width})")
-    if known is not None and (known.shape[0] != batch or known.shape[1] < frames - 1):
-        fault = f"known has the shape {tuple(known.shape)} for a prompt of {frames} frames"
-        raise HMAError("prompt", fault, f"give ({batch}, {frames - 1} or more)")
-    late = int(model.config.action_alignment == "previous")
-    conditioned = given.frames(slice(late, frames - 1 + late))  # a view
-    conditioned.chunks[:] = actions[:, : frames - 1, :width].to(device).float()
-    conditioned.known[:] = True if known is None else known[:, : frames - 1].to(device)
-    return given
+    batch, width, count = len(names), model.widest_chunk(names), frames - 1
+    if actions is None or not count:
+        return unknown(batch, frames, width, model.device)
+    if known is None:
+        known = torch.ones(actions.shape[:2], dtype=torch.bool)
+    chunks, present = actions[:, :count, :width], known[:, :count]
+    if chunks.shape != (batch, count, width) or present.shape != (batch, count):
+        fault = f"actions and known have the shapes {tuple(actions.shape)} and {tuple(known.shape)}"
+        wanted = f"({batch}, {count} or more, {width}) and ({batch}, {count} or more)"
+        raise HMAError("prompt", fault, f"give {wanted} for {frames} frames")
+    chunks, present = chunks.to(model.device).float(), present.to(model.device)
+    return align(model.config, F.pad(chunks, (0, 0, 0, 1)), F.pad(present, (0, 1)), frames)
 
 
 def _step_chunk(model: Network, names: Sequence[str], chunk: Tensor) -> Tensor:

@@ -85,8 +85,8 @@ class ActionConditioning:
     chunks: Tensor
     known: Tensor
 
-    def frames(self, chosen: slice | list[int]) -> "ActionConditioning":
-        """Return the chunks at those frames; of a slice, a view."""
+    def frames(self, chosen: list[int]) -> "ActionConditioning":
+        """Return the chunks at those frames."""
         return ActionConditioning(self.chunks[:, chosen], self.known[:, chosen])
 
 
