@@ -161,10 +161,7 @@ def described(model: Network, embodiment: str) -> Embodiment | None:
     Raises:
         HMAError: the model lacks the embodiment.
     """
-    if embodiment not in model.embodiments:
-        there = ", ".join(model.embodiments) or "none"
-        remedy = "choose one of them, or add yours: hma finetune SHARDS --from CHECKPOINT --out RUN"
-        raise HMAError(embodiment, f"is not in the model, which has: {there}", remedy)
+    model.stem(embodiment)  # raises without one
     kept = _checkpoint(model, embodiment)
     if kept is not None:
         return kept.embodiment(embodiment)

@@ -129,8 +129,8 @@ class Network(nn.Module):
     def _of(self, modules: nn.ModuleDict, embodiment: str) -> nn.Module:
         if embodiment not in self.embodiments:
             there = ", ".join(self.embodiments) or "none"
-            fault = f"the model has no such embodiment; it has {there}"
-            raise HMAError(embodiment, fault, "add or load the embodiment first")
+            remedy = "choose one of them, or add yours: hma finetune SHARDS --from CHECKPOINT --out RUN"
+            raise HMAError(embodiment, f"is not in the model, which has: {there}", remedy)
         return modules[module_key(embodiment)]
 
     # -- states -----------------------------------------------------------------------------------------

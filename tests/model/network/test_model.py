@@ -247,7 +247,7 @@ def test_another_embodiment_of_the_same_id_is_refused() -> None:
 
 def test_an_embodiment_that_is_not_there_is_named() -> None:
     model = small_model()
-    with pytest.raises(HMAError, match="dog: the model has no such embodiment; it has arm, hand.v1"):
+    with pytest.raises(HMAError, match="dog: is not in the model, which has: arm, hand.v1"):
         model.video_logits(small_batch(model.config, ["arm"]).tokens, None, "dog")
 
 
