@@ -14,7 +14,6 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from hma_data.errors import CheckpointError
 from hma_model.config import READOUTS, HMAConfig
 from hma_model.network.stem import varying
 
@@ -53,22 +52,15 @@ def state_from_released(state: Mapping[str, Tensor], config: HMAConfig) -> tuple
     """Split and rename a released state.
 
     Args:
-        state: the released names and tensors.
+        state: the released names and tensors, which fit the configuration.
         config: the result of `config_from_released`.
 
     Returns:
         The state for `HMA.load_trunk`, and the stem and head of each embodiment, all float32.
     """
     source = {name: tensor.float() for name, tensor in state.items()}
-    try:
-        trunk = _trunk(source, config)
-        parts = {
-            name: (_stem(source, name, config), _head(source, name, config)) for name in domains_of(state)
-        }
-    except KeyError as error:
-        fault = f"{error.args[0]} is missing"
-        raise CheckpointError("released weights", fault, "is the file complete?") from error
-    return trunk, parts
+    parts = {name: (_stem(source, name, config), _head(source, name, config)) for name in domains_of(state)}
+    return _trunk(source, config), parts
 
 
 def state_to_released(
