@@ -32,8 +32,13 @@ def known_digits(frames: Tensor, config: HMAConfig) -> Tensor:
     return digits.masked_fill(masked.unsqueeze(-1), -1)
 
 
-def frames_before(frames: Tensor, previous: list[int], config: HMAConfig) -> Tensor:
-    """Return the digits (B, T, S, F) of the frames (B, N, S) numbered `previous` (T,), or -1 for no frame."""
+def frames_before(frames: Tensor, previous: list[int], config: HMAConfig) -> Tensor | None:
+    """Return the digits (B, T, S, F) of the frames (B, N, S) numbered `previous` (T,), or -1 for no frame.
+
+    A model that does not copy them needs none: None.
+    """
+    if not config.copy_previous:
+        return None
     masked = torch.full_like(frames[:, :1], config.mask_id)
     return known_digits(torch.cat([frames, masked], dim=1)[:, previous], config)  # the last one is masked
 

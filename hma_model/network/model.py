@@ -100,9 +100,7 @@ class HMA(Network):
         groups, times = Groups.of(embodiment, len(tokens)), self.time_positions(tokens.shape[1])
         values = groups.sort(self.frame_values(tokens))
         given = None if true is None else to_digits(groups.sort(self.frame_values(true)), self.config.digits)
-        before = None
-        if self.config.copy_previous:
-            before = frames_before(values, list(range(-1, values.shape[1] - 1)), self.config)
+        before = frames_before(values, list(range(-1, values.shape[1] - 1)), self.config)
         chunks = None if actions is None else align(self.config, actions, action_mask, values.shape[1])
         conditioning = self.condition(chunks, groups, times.positions)
         features = self.video_features(self.trunk(self.embed(values), conditioning, times))

@@ -173,7 +173,7 @@ def readout_inputs(
     config, previous = model.config, layout.previous[layout.predicted]
     own = model.video_features(features)[:, layout.predicted]
     if config.discrete:
-        return own, frames_before(shown, previous, config) if config.copy_previous else None
+        return own, frames_before(shown, previous, config)
     kept = None
     if config.copy_previous:
         hidden = groups.sort(video.masked.to(shown.device)).unsqueeze(-1)

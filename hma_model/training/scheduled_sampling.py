@@ -84,7 +84,7 @@ def _predicted(
     features = model.trunk(x, model.condition(given, groups, times.positions), times)
     own = model.video_features(features)[:, past:]
     if config.discrete:
-        before = frames_before(shown, [past - 1], config) if config.copy_previous else None
+        before = frames_before(shown, [past - 1], config)
         scores = model.token_readout.split(model.token_readout(own, None, before))
         tokens = groups.unsort(from_digits(model.token_readout.taken(scores), config.digits))
         return split_tokens(tokens, config.merge, config.vocab_size, grid)[:, 0].to(context.dtype)

@@ -92,7 +92,7 @@ def test_digits_are_chosen_from_the_scores_of_the_loss(changes):
 
 
 def test_a_masked_place_and_a_frame_without_one_before_gain_nothing():
-    config = small_config(factored=(4, 4))
+    config = small_config(factored=(4, 4), copy_previous=True)
     frames = torch.tensor([[[0, 5, 16], [7, 16, 16]]])
     digits = frames_before(frames, [-1, 0, 1], config)
     assert torch.equal(digits[0, 0], torch.full((3, 2), -1))
