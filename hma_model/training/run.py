@@ -20,6 +20,7 @@ from torch import Tensor
 from hma_data.errors import CheckpointError, RecipeError, TrainingError, UsageError
 from hma_data.loading.dataset import Batch, open_sets
 from hma_data.shards.reader import ShardSet
+from hma_data.shards.stats import Stats
 from hma_data.storage.files import read_json, remove_partial, remove_parts, to_json, write_atomic
 from hma_data.storage.paths import addressed, is_repository
 from hma_model.checkpoint import io as checkpoints
@@ -80,18 +81,14 @@ def pooled_statistics(sets: Mapping[str, ShardSet]) -> dict[str, dict[str, Any]]
     """Return the statistics of each robot; of the actions, those over all robots that share them."""
     stats = {name: shards.manifest.stats for name, shards in sets.items()}
     for names in sharing(sets):
-        parts = [stats[name]["action"] for name in names]
-        counts = np.array([part["count"] for part in parts], np.float64)[:, None]
-        mean, std, low, high = (
-            np.array([part[key] for part in parts], np.float64) for key in ("mean", "std", "min", "max")
-        )
-        share = counts / counts.sum()
-        middle = (share * mean).sum(axis=0)
-        spread = np.sqrt((share * (std**2 + (mean - middle) ** 2)).sum(axis=0))
-        pooled = {"count": int(counts.sum()), "mean": middle.tolist(), "std": spread.tolist()}
-        pooled |= {"min": low.min(axis=0).tolist(), "max": high.max(axis=0).tolist()}
+        pooled = Stats.empty(len(stats[names[0]]["action"]["mean"]))
         for name in names:
-            stats[name] = stats[name] | {"action": pooled}
+            part = stats[name]["action"]
+            mean, std, low, high = (np.array(part[key], np.float64) for key in ("mean", "std", "min", "max"))
+            pooled.merge(Stats(part["count"], mean, part["count"] * std**2, low, high))
+        arrays = {key: getattr(pooled, key).tolist() for key in ("mean", "std", "min", "max")}
+        for name in names:
+            stats[name] = stats[name] | {"action": {"count": pooled.count, **arrays}}
     return stats
 
 
