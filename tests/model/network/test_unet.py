@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from hma_data.errors import HMAError, RecipeError, TokenizerError
+from hma_data.errors import RecipeError, TokenizerError
 from hma_data.tokenizers.base import TokenizerSpec
 from hma_model import HMA
 from hma_model.config import HMAConfig
@@ -301,12 +301,6 @@ def test_a_model_is_trained_on_squares() -> None:
     output = model(seen, generator=torch.Generator().manual_seed(0))
     output.loss.backward()
     assert torch.isfinite(output.loss) and output.masked.shape == (2, model.config.frames, 6, 6)
-
-
-def test_a_square_is_no_frame_for_a_rollout() -> None:
-    model = unet(**{**COLORS, "crop": 6})
-    with pytest.raises(HMAError, match=r"frame has the shape \(6, 6\), but the model takes \(8, 8\)"):
-        model.generate(stored(model, 1, 2)[..., :6, :6], torch.zeros(1, 4, 6), "arm", 3)
 
 
 @pytest.mark.parametrize(

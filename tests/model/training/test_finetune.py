@@ -170,13 +170,6 @@ def test_what_does_not_fit_the_checkpoint_is_refused_and_leaves_no_folder(
     assert not (tmp_path / "new").exists()
 
 
-def test_how_it_is_trained_may_differ(base, leg, tmp_path):
-    assert (
-        tune(base.out, leg, tmp_path / "run", "model.label_smoothing=0.1", "model.width=16", "digits=8").step
-        == 4
-    )
-
-
 def test_a_killed_finetuning_goes_on_bit_for_bit_though_its_source_is_gone(base, leg, tmp_path):
     whole = tune(base.out, leg, tmp_path / "whole", freeze=False)
     source = tmp_path / "hub"
@@ -376,11 +369,6 @@ def test_the_trunk_is_fetched_with_what_concerns_the_robot(published, tmp_path, 
     assert {"config.json", "trunk.safetensors"} <= served
     assert {one for one in served if one.startswith("embodiments/")} == parts
     assert name in Checkpoint.open(result.checkpoint).embodiments
-
-
-def test_the_robot_joins_the_others_in_the_repository(published, leg, tmp_path):
-    hub.push(tune(REPO, leg, tmp_path / "run").checkpoint, REPO)
-    assert set(hub.from_pretrained(REPO).embodiments) == {"arm", "hand", "leg"}
 
 
 @pytest.mark.parametrize("form", ["{}@{}", "hf://{}@{}"])

@@ -90,12 +90,6 @@ def test_a_resumed_run_supersedes_what_was_written_beyond_its_step(data, tmp_pat
     assert len(values(rest, "train/loss")) == 2
 
 
-def test_without_a_package_for_it_nothing_is_tracked(data, tmp_path):
-    given = {key: value for key, value in TINY.items() if key != "track"}
-    train(make_recipe({**given, "data": data, "steps": 1}), out=tmp_path / "run", show=False)
-    assert not (tmp_path / "run" / "tensorboard").exists()
-
-
 def test_an_event_file_that_cannot_be_written_is_one_error(data, tmp_path):
     plain = make_recipe({**TINY, "data": data, "steps": 1})
     out = train(plain, out=tmp_path / "run", show=False).out
@@ -240,12 +234,6 @@ def test_a_curve_is_the_mean_of_its_last_steps_also_after_a_huge_loss(monkeypatc
 def test_a_curve_takes_no_longer_for_its_width(monkeypatch):
     monkeypatch.setattr(np, "convolve", lambda *_: pytest.fail("a product for each value and each of width"))
     assert b"<svg" in loss_curves({"arm": [(step, 1.0) for step in range(100)]}, {}, "loss")
-
-
-def test_the_run_folder_has_its_recipe_and_ground(run):
-    ground = json.loads((run / "environment.json").read_text())
-    assert {"git_revision", "torch", "python", "device", "ranks"} <= ground.keys()
-    assert json.loads((run / "recipe.json").read_text())["steps"] == 6
 
 
 def facts(step: int, loss: float = 2.0, **given) -> dict:

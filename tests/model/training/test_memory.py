@@ -68,7 +68,7 @@ def forward(model: HMA, recipe: Recipe) -> torch.Tensor:
         return model(batch, objective, torch.Generator().manual_seed(0)).loss
 
 
-SMALL, WIDE = {"model": {"layers": 4, "width": 192}}, {"model": {"layers": 8, "width": 256}}
+SMALL = {"model": {"layers": 4, "width": 192}}
 PAIRS = {"model": {"layers": 6, "width": 192, "training_pass": "pairs"}}
 DIFFUSION = {"model": {"layers": 4, "width": 128, "diffusion_width": 512}, "batch_size": 8}
 # Of enough windows that the passes outweigh what the process itself takes, which varies from run to run.
@@ -77,12 +77,8 @@ WHOLE = load_recipe("unet_colors", ["frames=6", "batch_size=8", "model.crop=0"])
 MEASURED = [
     (TOKENS, SMALL),
     (PIXELS, UNET),
-    (PIXELS, {**UNET, "precision": "fp32"}),
     (COLORS, WHOLE),
-    (TOKENS, WIDE),
-    (TOKENS, {**WIDE, "objectives": {"policy": 1}}),
-    (TOKENS, {**WIDE, "checkpointing": True}),
-    (TOKENS, {**SMALL, "precision": "bf16"}),  # minutes of a processor without such products
+    (TOKENS, {"model": {"layers": 8, "width": 256}, "checkpointing": True}),
     (TOKENS, PAIRS),
     (LATENTS, DIFFUSION),
 ]

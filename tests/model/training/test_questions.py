@@ -43,35 +43,6 @@ def test_intervals_are_those_of_students_t(tmp_path: Path) -> None:
     assert questions.table(lines).splitlines()[-1] == f"| one | 3 | {mean:.2f} ± {half:.2f} |"
 
 
-def test_runs_of_several_budgets_are_not_averaged(tmp_path, capsys, monkeypatch) -> None:
-    gains = iter([1.0, 3.0])
-    monkeypatch.setattr(
-        questions, "measure",
-        lambda question, row, seed, budget, shards: {
-            "row": row.name, "seed": seed, "cpu_seconds": budget, "gain": next(gains), "psnr_last": 20.0,
-        },
-    )  # fmt: skip
-    for seconds in ("3", "90"):
-        words = [
-            "table2",
-            str(tmp_path),
-            "--seeds",
-            "1",
-            "--rows",
-            "soft tokens, HMA",
-            "--cpu-seconds",
-            seconds,
-        ]
-        monkeypatch.setattr("sys.argv", ["questions.py", *words])
-        questions.main()
-    said = capsys.readouterr().out
-    assert "soft tokens, HMA, seed 0, 90 CPU s: psnr last 20.00, gain 3.00\n" in said
-    assert said.splitlines()[-2:] == [
-        "| soft tokens, HMA, 3 CPU s | 1 | 20.00 | 1.00 |",
-        "| soft tokens, HMA, 90 CPU s | 1 | 20.00 | 3.00 |",
-    ]
-
-
 def test_the_baseline_learns_and_keeps_the_prompt_out_of_its_frames(tmp_path: Path) -> None:
     spec = TokenizerSpec("lab", 1, "continuous", 16, (4, 4), channels=2, latent_scale=3.0, dtype="float16")
     shards = ShardSet(make_shards(tmp_path / "arm", "arm", spec=spec))
@@ -101,11 +72,3 @@ class Blank:
 
     def decode(self, latents: np.ndarray) -> np.ndarray:
         return np.zeros((len(latents), 16, 16, 3), np.uint8)
-
-
-@pytest.mark.slow
-def test_a_row_is_trained_and_measured(tmp_path: Path) -> None:
-    shards = questions.Shards(tmp_path, None)
-    line = questions.measure("fig5a", questions.QUESTIONS["fig5a"][0], 0, 3.0, shards)
-    assert line["steps"] > 0 and line["seconds_a_frame"] > 0
-    assert all(value > 5 for value in (line["psnr_last"], line["copy"], line["loss"]))

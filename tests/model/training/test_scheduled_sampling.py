@@ -14,7 +14,6 @@ from hma_model.training.run import Run
 from hma_model.training.scheduled_sampling import SAMPLE_STEPS, forwarded
 from tests.model.robots import CONFIG, make_model
 from tests.model.runs import TINY
-from tests.model.shards import make_shards
 
 FRAMES = 6
 ROBOTS = {"arm": 2, "hand": 3}
@@ -79,8 +78,8 @@ def test_the_loss_asks_for_the_truth_and_its_gradient_reaches_every_layer(model)
             assert parameter.grad is not None and parameter.grad.abs().sum() > 0, name
 
 
-def test_a_past_of_its_own_begins_at_its_step(tmp_path):
-    data = [str(make_shards(tmp_path / "arm", "arm"))]
+def test_a_past_of_its_own_begins_at_its_step(arm_shards, tmp_path):
+    data = [str(arm_shards)]
     own, plain = (
         train(
             make_recipe({**TINY, "data": data, "self_forward": 0.5, "self_forward_from": step}),
@@ -92,27 +91,20 @@ def test_a_past_of_its_own_begins_at_its_step(tmp_path):
     assert plain.losses[:2] == own.losses[:2] and plain.losses != own.losses
 
 
-def test_sharded_ranks_are_refused(tmp_path):
-    data = [str(make_shards(tmp_path / "arm", "arm"))]
-    recipe = make_recipe({**TINY, "data": data, "self_forward": 0.5, "parallel": "fsdp"})
-    with pytest.raises(RecipeError, match="use parallel=ddp"):
+SKIPS = {"objectives": {"forward": 0.5, "passive": 0.5}, "model": {**TINY["model"], "absent_action": "skip"}}
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"self_forward": 0.5}, "self_forward: does not work with parallel=fsdp"),
+        (SKIPS, "absent_action: skip does not work with parallel=fsdp"),
+    ],
+)
+def test_sharded_ranks_are_refused_where_they_would_disagree(arm_shards, tmp_path, changes, said):
+    recipe = make_recipe({**TINY, "data": [str(arm_shards)], "parallel": "fsdp", **changes})
+    with pytest.raises(RecipeError, match=f"{said}.* use parallel=ddp"):
         Run(recipe, tmp_path, torch.device("cpu"), Ranks(0, 2))
-
-
-def test_passes_that_skip_actions_are_refused_where_they_would_disagree(tmp_path):
-    data = [str(make_shards(tmp_path / "arm", "arm"))]
-    objectives = {"forward": 0.5, "passive": 0.5}
-    recipe = {**TINY, "data": data, "objectives": objectives, "parallel": "fsdp"}
-    recipe["model"] = {**TINY["model"], "absent_action": "skip"}
-    with pytest.raises(RecipeError, match="absent_action: skip does not work with parallel=fsdp"):
-        Run(make_recipe(recipe), tmp_path, torch.device("cpu"), Ranks(0, 2))
-
-
-def test_no_loss_is_due_on_padded_frames(model):
-    true = batch(2)
-    padded = replace(true, frame_mask=torch.tensor([[True] * 3 + [False] * 3, [True] * 6]))
-    output = model(padded, "forward", torch.Generator().manual_seed(5))
-    assert not output.masked[0, 3:].any() and output.masked[1, 3:].any()
 
 
 CONTINUOUS = {

@@ -28,6 +28,8 @@ from tests.model.runs import TINY, same, train_until
 from tests.model.shards import make_shards
 from tests.model.training.test_parallel import spread
 
+OTHER = TokenizerSpec(**{**SPEC.to_json(), "name": "other"})
+
 
 @pytest.fixture
 def data(arm_shards: Path) -> list[str]:
@@ -96,9 +98,8 @@ def test_the_folder_of_another_run_is_refused_with_what_differs(recipe, data, tm
 
 
 def test_shards_of_two_tokenizers_are_refused_with_both_names(recipe, data, tmp_path):
-    spec = TokenizerSpec(**{**SPEC.to_json(), "name": "coded"})
-    other = make_shards(tmp_path / "hand", "hand", spec=spec)
-    with pytest.raises(ShardError, match="tokenized by coded .* by raw"):
+    other = make_shards(tmp_path / "hand", "hand", spec=OTHER)
+    with pytest.raises(ShardError, match="tokenized by other .* by raw"):
         train(recipe(data=[*data, str(other)]), out=tmp_path / "run", show=False)
 
 
@@ -282,33 +283,29 @@ def test_a_newer_releases_checkpoint_is_not_passed_over(averaged, tmp_path, whol
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("shards", "network", "message"),
     [
-        ({"model": {**TINY["model"], "width": 32}}, "another network: width is 32, it was 16"),
-        ({"model": {**TINY["model"], "qk_norm": True}}, "another network: qk_norm is True, it was False"),
+        ({}, {"width": 32}, "another network: width is 32, it was 16"),
+        ({"spec": OTHER}, {}, "another tokenizer: 'raw', now 'other'"),
+        ({"dims": 5}, {}, "was started on arm with action_dim 2, the shards have 5"),
     ],
 )
-def test_not_even_force_goes_on_with_another_network(averaged, whole, changes, message):
+def test_not_even_force_goes_on_with_another_network_tokenizer_or_actions(
+    averaged, whole, tmp_path, shards, network, message
+):
+    changes = {"model": {**TINY["model"], **network}}
+    if shards:
+        changes["data"] = [str(make_shards(tmp_path / "arm", "arm", **shards))]
     with pytest.raises(RecipeError, match=message):
         train(averaged(**changes, steps=8), out=whole, show=False, force=True)
 
 
-def test_not_even_force_goes_on_with_another_tokenizer(averaged, whole, tmp_path):
-    spec = TokenizerSpec(**{**SPEC.to_json(), "name": "other"})
-    shards = make_shards(tmp_path / "arm", "arm", spec=spec)
-    with pytest.raises(RecipeError, match="another tokenizer: 'raw', now 'other'"):
-        train(averaged(data=[str(shards)], steps=8), out=whole, show=False, force=True)
-
-
-def test_not_even_force_goes_on_with_other_actions(averaged, whole, tmp_path):
-    shards = make_shards(tmp_path / "arm", "arm", dims=5)
-    with pytest.raises(RecipeError, match="was started on arm with action_dim 2, the shards have 5"):
-        train(averaged(data=[str(shards)], steps=8), out=whole, show=False, force=True)
-
-
-@pytest.mark.parametrize("out", [None, "", " "])
-def test_what_cannot_be_a_folder_is_wrong_usage(averaged, out):
-    with pytest.raises(UsageError, match="out: is not given"):
+@pytest.mark.parametrize(
+    ("out", "said"),
+    [(None, "is not given"), (" ", "is not given"), ("s3://bucket/run", "not a local folder")],
+)
+def test_what_cannot_be_a_folder_is_wrong_usage(averaged, out, said):
+    with pytest.raises(UsageError, match=said):
         train(averaged(), out=out, show=False)
 
 
