@@ -49,7 +49,7 @@ from hma_model.training.resume import (
     seed_for,
     write_state,
 )
-from hma_model.training.runtime import ENVIRONMENT, RECIPE, attention_form, choose_precision, environment
+from hma_model.training.runtime import ENVIRONMENT, RECIPE, choose_precision, environment
 from hma_model.training.scheduled_sampling import forwarded
 from hma_model.training.start import Start
 
@@ -144,9 +144,8 @@ class Run:
             return choose_precision(recipe, config, self.device, begun)
 
         precision, reason = self.ranks.once(choose)
-        chosen = recipe.model_copy(update={"precision": precision})
-        self.arithmetic = f"precision {precision}: {reason}; {attention_form(chosen, config, self.device)}"
-        return chosen
+        self.arithmetic = f"precision {precision}: {reason}"
+        return recipe.model_copy(update={"precision": precision})
 
     def _config(self, recipe: Recipe) -> HMAConfig:
         if self.start:

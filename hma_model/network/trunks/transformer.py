@@ -200,8 +200,7 @@ class TemporalAttention(Attention):
         Return (B, T, N, D).
         """
         b, t, n, heads, size = q.shape
-        allowed = times.allowed if times.allowed.dim() == 3 else times.allowed.unsqueeze(0)
-        allowed = allowed[:, -t:]
+        allowed = times.allowed[:, -t:]  # (1 or B, T, R)
         exporting = torch.compiler.is_exporting()
         if torch.compiler.is_compiling() and not exporting:
             return self._recall_fused(q, allowed, cache)
