@@ -162,7 +162,7 @@ def described(model: Network, embodiment: str) -> Embodiment | None:
         HMAError: the model lacks the embodiment.
     """
     model.stem(embodiment)  # raises without one
-    kept = _checkpoint(model, embodiment)
+    kept = checkpoint_of(model, embodiment)
     if kept is not None:
         return kept.embodiment(embodiment)
     try:
@@ -181,17 +181,18 @@ def yaml_of(model: Network, embodiment: str) -> Embodiment:
 
 def card(model: Network, embodiment: str) -> dict[str, Any]:
     """Return the card of an embodiment of a model; empty if the model is not from a checkpoint."""
-    kept = _checkpoint(model, embodiment)
+    kept = checkpoint_of(model, embodiment)
     return {} if kept is None else kept.card(embodiment)
 
 
-def _checkpoint(model: Network, embodiment: str) -> Checkpoint | None:
+def checkpoint_of(model: Network, embodiment: str) -> Checkpoint | None:
+    """Return the checkpoint that a model was loaded from if it has an embodiment."""
     kept = model.source
     return kept if kept and embodiment in kept.embodiments else None
 
 
 def _seen(model: Network, embodiment: str) -> Float32s | None:
-    kept = _checkpoint(model, embodiment)
+    kept = checkpoint_of(model, embodiment)
     action = {} if kept is None else kept.stats(embodiment)["action"]
     if "min" not in action or "max" not in action:
         return None

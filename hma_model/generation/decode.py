@@ -17,6 +17,7 @@ from hma_data.storage.paths import StrPath, as_text
 from hma_data.tokenizers.base import Tokenizer
 from hma_data.tokenizers.network import NetworkTokenizer
 from hma_model.checkpoint.folder import EMBEDDED_NAME, resolve
+from hma_model.generation.commands import checkpoint_of
 from hma_model.network.model import HMA
 from hma_model.network.network import Network
 
@@ -56,8 +57,8 @@ def decode(tokenizer: Tokenizer, stored: Tensor) -> Images:
 
 def trained_cameras(model: Network, embodiment: str) -> Cameras:
     """Return the cameras that a robot's stem was trained on; the first one if no checkpoint tells them."""
-    kept = model.source
-    return kept.cameras(embodiment) if kept and embodiment in kept.embodiments else FIRST_CAMERA
+    kept = checkpoint_of(model, embodiment)
+    return kept.cameras(embodiment) if kept else FIRST_CAMERA
 
 
 def trained_shards(model: Network, embodiment: str) -> ShardSet | None:
