@@ -85,7 +85,7 @@ class ActionConditioning:
     chunks: Tensor
     known: Tensor
 
-    def frames(self, chosen: list[int]) -> "ActionConditioning":
+    def frames(self, chosen: slice | list[int]) -> "ActionConditioning":
         """Return the chunks at those frames."""
         return ActionConditioning(self.chunks[:, chosen], self.known[:, chosen])
 
