@@ -33,10 +33,7 @@ def known_digits(frames: Tensor, config: HMAConfig) -> Tensor:
 
 
 def frames_before(frames: Tensor, previous: list[int], config: HMAConfig) -> Tensor | None:
-    """Return the digits (B, T, S, F) of the frames (B, N, S) numbered `previous` (T,), or -1 for no frame.
-
-    A model that does not copy them needs none: None.
-    """
+    """Return digits (B, T, S, F) of frames (B, N, S) at `previous` (T,), or -1; None if none is copied."""
     if not config.copy_previous:
         return None
     masked = torch.full_like(frames[:, :1], config.mask_id)

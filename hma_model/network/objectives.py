@@ -138,7 +138,7 @@ def compute(
     features = model.trunk(x, conditioning, layout.times)
 
     video_loss = action_loss = logits = None
-    masked, per_sample = video.masked, torch.zeros(groups.batch, device=features.device)
+    masked, loss = video.masked, torch.zeros((), device=features.device)
     if chosen.readout is not None:
         action_loss, per_sample = _action_loss(
             model, features[:, : layout.past], batch, dropped, chosen.readout, groups, generator
@@ -155,9 +155,9 @@ def compute(
             masked = F.pad(masked, (0, 0, 1, 0))
         if config.discrete and not model.training:
             logits = _video_logits(model, features, own, before, frames, layout, groups)
-    loss = torch.zeros((), device=features.device)
-    loss = loss if video_loss is None else loss + video_loss
-    loss = loss if action_loss is None else loss + ACTION_LOSS_WEIGHT * action_loss
+        loss = loss + video_loss
+    if action_loss is not None:
+        loss = loss + ACTION_LOSS_WEIGHT * action_loss
     grid = config.token_grid if places is None else (-1, config.crop)
     masked = masked.to(features.device).unflatten(2, grid)
     return Output(loss, video_loss, action_loss, per_sample.detach(), masked, name, logits)
