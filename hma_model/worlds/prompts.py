@@ -75,12 +75,10 @@ class EpisodePart:
             start = next((part.start for part in parts if span < len(part)), 0)
         part = next((part for part in parts if start in part), range(0))
         if span < 0 or start + span not in part:
-            apart = "" if stride == 1 else f", {stride} rows apart"
-            pauses = ", ".join(str(part.stop - 1) for part in parts[:-1])
-            fault = (
-                f"{count} frames{apart}, from row {start} on do not fit an episode of {parts[-1].stop} rows"
-            )
-            if pauses:
+            fault = f"{count} frames, {stride} rows apart, from row {start} on do not fit an episode of "
+            fault += f"{parts[-1].stop} rows"
+            if len(parts) > 1:
+                pauses = ", ".join(str(part.stop - 1) for part in parts[:-1])
                 fault += f" that pauses after row {pauses}"
             raise UsageError("prompt", fault, "choose another start or fewer frames")
         return np.arange(start, start + span + 1, stride)

@@ -95,7 +95,6 @@ class LabScene:
         self, embodiment: Embodiment, dims: tuple[Dimension, ...], number: int, size: int = SIZE
     ) -> None:
         self.stride = embodiment.stride
-        self.width = embodiment.action_dim
         self.size = size
         self.simulator = LabSimulator(embodiment.id)
         frames = [self._fitted(self.simulator.reset(seed=SCENE_SEED, episode=number))]
@@ -105,16 +104,13 @@ class LabScene:
             frames.append(frame)
             chunks.append(chunk)
         self.prompt = Prompt(np.stack(frames), np.stack(chunks))
-        self.action = at_rest(dims, self.prompt.chunks[-1][-self.width :])
+        self.action = at_rest(dims, self.prompt.chunks[-1][-embodiment.action_dim :])
 
     def advance(self, chunk: Float32s | None) -> tuple[Float32s, Images]:
+        given = None if chunk is None else chunk.reshape(self.stride, -1)
         taken = []
         for step in range(self.stride):
-            action = (
-                self.simulator.recorded()
-                if chunk is None
-                else chunk[step * self.width : (step + 1) * self.width]
-            )
+            action = self.simulator.recorded() if given is None else given[step]
             self.simulator.advance(action)
             taken.append(action)
         return np.concatenate(taken).astype(np.float32), self._fitted(self.simulator.picture())
