@@ -89,15 +89,10 @@ class Pendulum:
         self._env.step(action)
 
 
-def start(seed: int, episode: int) -> tuple[Pendulum, np.random.Generator]:
-    """Return the pendulum at the start of an episode, and the generator of its driver."""
-    rng = np.random.default_rng((seed, 2, episode))
-    return Pendulum(rng.uniform(-np.pi, np.pi), rng.uniform(-4, 4)), rng
-
-
 def begin(robot: str, seed: int, episode: int) -> tuple[Pendulum, Callable[[], Float32s]]:
     """Return the simulation of an episode at its start, and the recorder's driver of torques (1,)."""
-    world, rng = start(seed, episode)
+    rng = np.random.default_rng((seed, 2, episode))
+    world = Pendulum(rng.uniform(-np.pi, np.pi), rng.uniform(-4, 4))
     _, manoeuvre = DRIVERS[episode % len(DRIVERS)]
     drive = manoeuvre(rng)
 

@@ -91,7 +91,7 @@ def test_gymnasium_replays_the_pendulum(recordings: dict[str, Recorded]) -> None
     import gymnasium
 
     for i in range(EPISODES):
-        begun, _ = pendulum.start(SEED, i)
+        begun, _ = pendulum.begin("pendulum", SEED, i)
         env: Any = gymnasium.make("Pendulum-v1")
         env.reset(seed=0)
         env.unwrapped.state = np.array([begun.angle, begun.speed])
