@@ -204,38 +204,29 @@ def _levels(picture: Images) -> list[Images]:
     return levels
 
 
-def _source_files(source: FileSource | DrawnSource, corpus: Path) -> list[Path]:
-    folder = corpus / source.path
-    files = sorted({path for glob in source.glob for path in folder.glob(glob)})
-    if isinstance(source, DrawnSource):
-        if len(files) != source.pictures:
-            fault = f"holds {len(files)} images, the recipe says {source.pictures}"
-            raise RecipeError(folder, fault, f"recipes/tokenizer/draw.py {corpus} makes them")
-    elif not files:
-        fault = f"no file matches {', '.join(source.glob)}"
-        raise RecipeError(folder, fault, f"unpack {source.origin} there")
-    return files
-
-
 def load_pools(sources: Sequence[FileSource | DrawnSource], corpus: Path) -> tuple[list[Pool], str]:
     """Read all images of the sources into memory; return them and a SHA-256 of their pixels.
 
     Raises:
-        RecipeError: a source has no image.
+        RecipeError: a source has no image, or another number of drawn ones than the recipe says.
     """
     digest = hashlib.sha256()
     pools = []
     for source in sources:
-        pictures = []
-        for file in _source_files(source, corpus):
+        folder, pictures = corpus / source.path, []
+        files = sorted({path for glob in source.glob for path in folder.glob(glob)})
+        if isinstance(source, DrawnSource) and len(files) != source.pictures:
+            fault = f"holds {len(files)} images, the recipe says {source.pictures}"
+            raise RecipeError(folder, fault, f"recipes/tokenizer/draw.py {corpus} makes them")
+        for file in files:
             with suppress(TokenizerError):  # a glob may match a file that is no image
                 for picture in read_pictures(file, source.frames):
                     if min(picture.shape[:2]) >= SMALLEST:
                         pictures.append(_levels(picture))
                         digest.update(pictures[-1][-1].tobytes())
         if not pictures:
-            fault = "holds no image that can be decoded and is large enough"
-            raise RecipeError(corpus / source.path, fault)
+            fault = f"holds no image of {SMALLEST} pixels a side or more as {', '.join(source.glob)}"
+            raise RecipeError(folder, fault, f"unpack {source.origin} there")
         pools.append(Pool(source.path, source.weight, pictures))
     return pools, digest.hexdigest()
 

@@ -113,6 +113,7 @@ class DrawnSource(_Strict):
     pictures: int = Field(gt=0, default=200)
     weight: float = Field(gt=0, default=1.0)
     glob: ClassVar[list[str]] = ["*.png"]
+    origin: ClassVar[str] = "images of recipes/tokenizer/draw.py"
     frames: ClassVar[int] = 1
 
     @property
