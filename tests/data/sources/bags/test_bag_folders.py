@@ -165,10 +165,3 @@ def test_packed_parts_are_found_by_either_name(named: str, stale: bool, tmp_path
     names = [named.format(k) for k in range(1 if stale else 2)]
     (folder / "metadata.yaml").write_text(METADATA.format(", ".join(names)))
     assert pairs(folder, robot(), "run") == same(6)
-
-
-def test_the_remedy_for_a_missing_packed_part_works(tmp_path: Path) -> None:
-    folder = split(tmp_path / "run", "db3.zstd", 2, packed=True)
-    (folder / "metadata.yaml").write_text(METADATA.format("rec_0.db3, rec_7.db3"))
-    with pytest.raises(EpisodeError, match=r"names rec_7\.db3.*copy it in, or remove it"):
-        to_clip(SOURCE.read(str(folder), "run", robot()), robot())

@@ -226,24 +226,6 @@ def test_links_of_the_hub_cache_are_followed(bags, recording, kind, tmp_path) ->
         np.testing.assert_array_equal(episode.streams["front"].frames([0, 9]), recording.pictures[[0, 9]])
 
 
-def test_a_ros2_folder_in_several_files_is_one_episode(tmp_path: Path, recording: Recording) -> None:
-    folder = tmp_path / "split"
-    folder.mkdir()
-    parts = []
-    for i in range(3):
-        part, names = make_recording(4, seed=i), ("picture_ns", "joint_ns", "command_ns")
-        parts.append(replace(part, **{name: getattr(part, name) + 400_000_000 * i for name in names}))
-    for i in range(3):
-        part = KINDS["mcap-cdr-zstd"](tmp_path, parts[i])
-        part.rename(folder / f"split_{i}.mcap")
-    names = "\n".join(f"    - split/split_{i}.mcap" for i in range(3))
-    (folder / "metadata.yaml").write_text(f"rosbag2_bagfile_information:\n  relative_file_paths:\n{names}\n")
-    episode = read(folder, arm())
-    assert SOURCE.index(str(folder), arm())[0].frames == 12
-    pictures = np.concatenate([part.pictures for part in parts])
-    np.testing.assert_array_equal(episode.streams["front"].frames(range(12)), pictures)
-
-
 def test_inspect_lists_keys_as_a_yaml_names_them(bags: dict[str, Path]) -> None:
     found = SOURCE.inspect(str(bags["ros2-mcap"]))
     keys = {key.key: key for key in found.keys}
