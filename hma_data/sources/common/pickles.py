@@ -1,8 +1,8 @@
 """Read plain values from pickles without running code: numbers, texts, lists, dictionaries and numpy arrays.
 
-numpy saves a dictionary as an array of one object, which is a pickle of protocol 3 or 4. The standard
-library's unpickler asks `find_class` for every name that a pickle uses. Here it gets stand-ins for the few
-names that such pickles have, and an error for any other name.
+numpy saves a dictionary as an array of one object, which is a pickle. The standard library's unpickler asks
+`find_class` for every name that a pickle uses. Here it gets stand-ins for the few names that numpy writes,
+and an error for any other name.
 """
 
 import io
@@ -104,16 +104,25 @@ def _reconstruct(*_: Any) -> _Array:
     return _Array((0,), np.uint8)
 
 
-def _scalar(kind: Any, content: Any) -> Any:
+def _from_buffer(content: Any, kind: Any, shape: Any, order: str = "C") -> np.ndarray:
     _check_numbers(content, kind)
-    [value] = np.frombuffer(content, kind.dtype)
-    return value.item()
+    return np.frombuffer(content, kind.dtype).reshape(shape, order="F" if order == "F" else "C")
+
+
+def _scalar(kind: Any, content: Any) -> Any:
+    return _from_buffer(content, kind, (1,))[0].item()
 
 
 def _check_numbers(content: Any, kind: Any) -> None:
     is_plain = isinstance(kind, _Dtype) and kind.dtype.kind in _NUMBERS
-    if not is_plain or not isinstance(content, bytes):
+    if not is_plain or not isinstance(content, bytes | bytearray):
         raise ValueError("it has an array that is not of numbers")
+
+
+def _encode(text: Any, codec: Any) -> bytes:
+    if codec not in ("latin1", "latin-1") or not isinstance(text, str):
+        raise ValueError(f"it has text in {codec!r}")
+    return text.encode("latin-1")
 
 
 def _ndarray(*_: Any) -> None:
@@ -126,6 +135,10 @@ _STAND_INS: dict[tuple[str, str], Any] = {
     ("numpy._core.multiarray", "_reconstruct"): _reconstruct,
     ("numpy.core.multiarray", "scalar"): _scalar,
     ("numpy._core.multiarray", "scalar"): _scalar,
+    ("numpy.core.numeric", "_frombuffer"): _from_buffer,
+    ("numpy._core.numeric", "_frombuffer"): _from_buffer,
     ("numpy", "ndarray"): _ndarray,
     ("numpy", "dtype"): _Dtype,
+    ("_codecs", "encode"): _encode,
+    ("__builtin__", "bytes"): bytes,  # without arguments, by protocols 0 to 2
 }

@@ -49,7 +49,7 @@ VALUES = st.recursive(
 
 
 @given(
-    value=st.dictionaries(st.text(max_size=4) | st.integers(), VALUES, max_size=4), protocol=st.integers(3, 4)
+    value=st.dictionaries(st.text(max_size=4) | st.integers(), VALUES, max_size=4), protocol=st.integers(0, 5)
 )
 def test_a_dictionary_is_read_as_numpy_reads_it(value, protocol, tmp_path_factory):
     path = write(tmp_path_factory.mktemp("npy") / "x.npy", value, protocol)
@@ -59,14 +59,14 @@ def test_a_dictionary_is_read_as_numpy_reads_it(value, protocol, tmp_path_factor
 def test_shared_values_and_fortran_order_are_read(tmp_path):
     shared = np.asfortranarray(np.arange(6.0).reshape(2, 3))
     value = {"a": shared, "b": [shared, shared], "c": shared.T}
-    for protocol in (3, 4):
+    for protocol in range(6):
         assert equal(read_dict(write(tmp_path / "x.npy", value, protocol)), value)
 
 
 @pytest.mark.parametrize("protocol", range(6))
 def test_code_in_a_file_is_refused_and_does_not_run(protocol, tmp_path):
     path = write(tmp_path / "x.npy", {"a": Touch(tmp_path / "ran")}, protocol)
-    with pytest.raises(EpisodeError, match="which is neither a plain value nor an array"):
+    with pytest.raises(EpisodeError, match=r"posix\.system|nt\.system"):
         read_dict(path)
     assert not (tmp_path / "ran").exists()
 
@@ -92,7 +92,7 @@ HOSTILE: dict[str, Row] = {
     "an extension": (pickled(b"\x80\x02\x82\x01."), "cannot be read"),
     "nothing": (pickled(b""), "cannot be read"),
     "a memo of 32 GB in the C unpickler": (pickled(b"\x80\x02]r\xff\xff\xff\xff."), "not a dictionary"),
-    "an attribute of a function": (pickled(b"cnumpy\nndarray\n}S'a'\nI1\nsb."), "cannot be read"),
+    "an attribute of a function": (pickled(b"c_codecs\nencode\n}S'a'\nI1\nsb."), "cannot be read"),
     "no end": (pickled(b"\x80\x02}"), "cannot be read"),
     "numbers": (lambda path: np.save(path, np.arange(3)), "not a dictionary"),
     "objects": (lambda path: np.save(path, np.array([1, 2], dtype=object)), "not a dictionary"),

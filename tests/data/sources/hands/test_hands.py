@@ -82,7 +82,7 @@ def test_boxes_and_landmarks_of_a_table_give_centres_and_wrists(folder: Path) ->
         np.testing.assert_allclose(values, expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("protocol", [3, 4])
+@pytest.mark.parametrize("protocol", [3, 4, 5])
 def test_epic_kitchens_as_published(folder: Path, protocol: int) -> None:
     (folder / "P01").mkdir()
     with (folder / "P01" / "a.pkl").open("wb") as file:
