@@ -112,6 +112,9 @@ class WorldModelEnv(gymnasium.Env[Images, Float32s]):
             raise UsageError("embodiment", "is not given", f"give embodiment=ID; the model has: {there}")
         if control not in CONTROLS:
             raise UsageError("control", f"{control!r} is unknown", f"give {' or '.join(CONTROLS)}")
+        for name, value, unit in (("size", size, "of pixels"), ("horizon", horizon, "of steps")):
+            if value is not None and (not isinstance(value, int | np.integer) or value < 1):
+                raise UsageError(name, f"is {value!r}", f"give a whole number {unit}, 1 or more, or None")
         if size is not None and world.image_shape[0] != world.image_shape[1]:
             raise UsageError("size", "is for models of one view", "leave it out")
         self.world = world
@@ -258,6 +261,8 @@ class WorldModelVectorEnv(SyncVectorEnv):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         **settings: Any,
     ) -> None:
+        if not isinstance(num_envs, int | np.integer) or num_envs < 1:
+            raise UsageError("num_envs", f"is {num_envs}", "give a whole number of 1 or more")
         first = WorldModelEnv(*others, **settings)
         # copies made before any session is open: they share the world, its prompts and the warnings
         super().__init__([partial(copy.copy, first)] * num_envs, autoreset_mode=autoreset_mode)
@@ -266,7 +271,11 @@ class WorldModelVectorEnv(SyncVectorEnv):
 
     def step(self, actions: Any) -> tuple[Images, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         """Send an action, or a chunk, to each environment; those that get an image get it in one pass."""
-        begins = self._autoreset_envs & (self.autoreset_mode == AutoresetMode.NEXT_STEP)
+        ended = self._autoreset_envs
+        if self.autoreset_mode == AutoresetMode.DISABLED and ended.any():
+            fault = f"the episodes of {np.flatnonzero(ended).tolist()} have ended"
+            raise HMAError("step", fault, 'reset them: reset(options={"reset_mask": …})')
+        begins = ended & (self.autoreset_mode == AutoresetMode.NEXT_STEP)
         self.dream(np.flatnonzero(~begins), actions)
         return super().step(actions)
 

@@ -139,7 +139,7 @@ def test_a_vector_without_autoreset_starts_those_that_are_asked_for(how: dict[st
     again, _ = env.reset(seed=0, options={"reset_mask": mask})
     assert np.array_equal(again[0], first[0]) and not np.array_equal(again[1], first[1])
     assert env.step(chunks[1])[3].tolist() == [False, True]
-    with pytest.raises(AssertionError, match="autoreset"):  # of gymnasium
+    with pytest.raises(HMAError, match=r"the episodes of \[1\] have ended"):
         env.step(chunks[2])
     made = gymnasium.make_vec("hma/WorldModel-v0", 2, "vector_entry_point", **how)
     assert isinstance(made, WorldModelVectorEnv) and made.reset()[0].shape == (2, 64, 64, 3)
@@ -246,11 +246,21 @@ def test_an_action_that_is_refused_leaves_no_environment_of_a_vector_ahead(how: 
         ({"embodiment": None}, "embodiment: is not given — give embodiment=ID; the model has: pusht_fast"),
         ({"embodiment": "ur5"}, "ur5: is not in the model"),
         ({"control": "second"}, "'second' is unknown — give frame or chunk"),
+        ({"size": 0}, "size: is 0 — give a whole number of pixels"),
+        ({"size": 64.5}, "size: is 64.5 — give a whole number of pixels"),
+        ({"horizon": 0}, "horizon: is 0 — give a whole number of steps"),
+        ({"horizon": "3"}, "horizon: is '3' — give a whole number of steps"),
     ],
 )
 def test_bad_settings_are_refused(world: World, change: dict[str, Any], message: str) -> None:
     with pytest.raises(HMAError, match=message):
         WorldModelEnv(**{"embodiment": PUSH, "world": world, **change})
+
+
+@pytest.mark.parametrize("count", [0, 1.5])
+def test_a_vector_of_no_whole_number_of_environments_is_refused(world: World, count: Any) -> None:
+    with pytest.raises(HMAError, match=f"num_envs: is {count} — give a whole number of 1 or more"):
+        WorldModelVectorEnv(count, embodiment=PUSH, world=world)
 
 
 def test_an_option_of_a_reset_that_would_have_no_effect_is_refused(world: World) -> None:
