@@ -47,6 +47,7 @@ def psnr(truth: Values, pictures: Values, limit: float = math.inf) -> Floats:
     Returns:
         (…,).
     """
+    _require_pair(truth, pictures)
     error = np.square(np.subtract(truth, pictures, dtype=np.float64)).mean(axis=(-3, -2, -1))
     with np.errstate(divide="ignore"):
         return np.minimum(10 * np.log10(WHITE**2 / error), limit)
@@ -65,6 +66,7 @@ def ssim(truth: Values, pictures: Values) -> Floats:
     Returns:
         (…,), 1 if the two are equal.
     """
+    _require_pair(truth, pictures)
     *lead, height, width, channels = truth.shape
     if min(height, width) < SSIM_WINDOW:
         raise UsageError("ssim", f"images of {height}x{width} are smaller than its 7x7 window")
@@ -92,6 +94,12 @@ def _window_means(values: Floats) -> Floats:
     """Return the mean over every 7x7 window inside (H, W, C)."""
     edge = SSIM_WINDOW // 2
     return uniform_filter(values, SSIM_WINDOW, axes=(0, 1))[edge:-edge, edge:-edge]
+
+
+def _require_pair(truth: Values, pictures: Values) -> None:
+    if truth.shape != pictures.shape or truth.ndim < 3:  # shapes that broadcast would give a wrong figure
+        fault = f"the images must both be (…, H, W, C); they are {truth.shape} and {pictures.shape}"
+        raise UsageError("metrics", fault)
 
 
 def perplexity(nats: float) -> float:

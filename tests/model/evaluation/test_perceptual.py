@@ -170,6 +170,13 @@ def test_ssim_of_a_smooth_picture_on_a_bright_ground_is_scikit_images():
     assert ssim(truth, other) == pytest.approx(expected, rel=1e-6)
 
 
+def test_pictures_of_different_size_are_refused(pictures):
+    truth, other = pictures
+    for of_other_shape in (other[:, :-1], other[:, :1]):  # the second would broadcast
+        with pytest.raises(UsageError, match="must both be"):
+            psnr(truth, of_other_shape)
+
+
 def test_perplexity_does_not_overflow():
     assert perplexity(math.log(7)) == pytest.approx(7)
     assert perplexity(1e6) == math.inf
