@@ -12,11 +12,10 @@ import os
 import re
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator
 
-from hma_data.arrays import Bools
 from hma_data.errors import RegistryError, meant
 from hma_data.registry.components import (
     LAYOUTS,
@@ -38,6 +37,9 @@ from hma_data.storage.files import short_sha256
 from hma_data.storage.kinds import misplaced
 from hma_data.storage.paths import StrPath, as_path, as_text
 from hma_data.storage.yaml_io import Problem, parse_yaml, plain_fault, read_yaml, write_yaml
+
+if TYPE_CHECKING:  # `hma registry list` needs no numpy
+    from hma_data.arrays import Bools
 
 FIRST_CAMERA = "first"  # stands for the first camera of a set, whatever its name
 ID_PATTERN = re.compile(r"[a-z0-9][a-z0-9_.-]{0,99}")
@@ -236,7 +238,7 @@ class Embodiment(SpecModel):
         return self if kept == self.cameras else self.model_copy(update={"cameras": kept})
 
     @property
-    def normalize_mask(self) -> Bools:
+    def normalize_mask(self) -> "Bools":
         """Return (A,) bool, True where the model normalizes the value."""
         import numpy as np
 
