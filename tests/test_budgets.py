@@ -27,9 +27,9 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_data/storage": (1_697, 11_105, 11),
     "hma_data/tokenizers": (3_401, 24_708, 18),
     "hma_model": (570, 3_424, 4),
-    "hma_model/benchmark": (824, 6_970, 5),
+    "hma_model/benchmark": (836, 7_066, 5),
     "hma_model/checkpoint": (949, 7_299, 5),
-    "hma_model/cli": (1_742, 11_218, 12),
+    "hma_model/cli": (1_742, 11_211, 12),
     "hma_model/demo": (476, 4_000, 4),
     "hma_model/evaluation": (4_528, 35_813, 24),
     "hma_model/export": (1_160, 9_242, 9),
@@ -44,8 +44,8 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_670, 30_161, 20),
     "hma_model/worlds": (1_473, 10_918, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_052, 510_166
-TEST_LINES = 46_574
+PRODUCT_LINES, PRODUCT_NODES = 65_064, 510_255
+TEST_LINES = 46_579
 DOC_WORDS = 41_996
 
 

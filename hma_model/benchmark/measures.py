@@ -27,6 +27,7 @@ from hma_model.evaluation.agreement import share_interval
 from hma_model.evaluation.intervals import NATURAL, horizon_summary, rounded, summary
 from hma_model.evaluation.metrics import PSNR_LIMIT, PSNR_RANGE, psnr
 from hma_model.evaluation.probe import Probe
+from hma_model.evaluation.state_reader import Tell
 from hma_model.policies.arenas import ModelArena, Scenes, TrueArena
 from hma_model.policies.base import Policy
 from hma_model.policies.scores import run
@@ -56,9 +57,13 @@ def played(world: World, true: TrueArena, actions: Sequence[Float32s]) -> tuple[
 
 
 def choose(
-    world: World, scenes: Scenes, probe: Probe, policy: Policy, frames: int, choices: int = CHOICES
-) -> Arrays:
+    world: World, scenes: Scenes, probe: Probe, policy: Policy, frames: int, choices: int = CHOICES,
+    tell: Tell = lambda words: None,
+) -> Arrays:  # fmt: skip
     """Return what comes of C action sequences of each scene in the simulator and in the model.
+
+    Args:
+        tell: called before each, with words on it.
 
     Returns:
         `psnr`, `copy_psnr` (of the first frame repeated), `uncertainty` (N, C, T); `true`, `made`
@@ -67,6 +72,7 @@ def choose(
     kept = np.concatenate([probe.own, probe.loose])  # the parts whose places the probe reads
     found = defaultdict[str, list[NDArray[Any]]](list)
     for choice in range(choices):
+        tell(f"action sequence {choice + 1} of {choices}")
         true = TrueArena(replace(scenes, seed=scenes.seed + 1000 * choice), world.image_shape[0])
         pictures, actions = run("benchmark", policy, true, frames)
         true.scenes = scenes  # the model's random numbers are the same for all sequences of a scene

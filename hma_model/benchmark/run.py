@@ -38,7 +38,6 @@ from hma_model.evaluation.calibration import calibration
 from hma_model.evaluation.intervals import NATURAL, rounded, summary
 from hma_model.evaluation.metrics import PSNR_RANGE
 from hma_model.evaluation.probe import Probe, train_probe
-from hma_model.evaluation.state_reader import Tell
 from hma_model.policies.arenas import Scenes
 from hma_model.policies.fingerprints import device_facts, world_digests, world_facts
 from hma_model.policies.judge import task_of, train_judge
@@ -49,7 +48,8 @@ from hma_model.worlds.world import World, load_world
 VERSION = 2
 WORK = ".benchmark"
 NOISE = 0.5  # share of random chunks in the action sequences of a choice
-Progress = Callable[[float, str], None]
+PARTS = 5  # of a robot
+Progress = Callable[[int, str, int], None]
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def benchmark(
     *,
     seed: int = 0,
     world: World | None = None,
-    on_progress: Progress = lambda done, words: None,
+    on_progress: Progress = lambda done, words, total: None,
     **settings: Any,
 ) -> dict[str, Any]:
     """Measure a checkpoint, write benchmark.json to a folder, and return what it holds.
@@ -97,7 +97,7 @@ def benchmark(
         protocol: FULL or QUICK.
         seed: of scenes, goals, policies and probes; 0 is the protocol's own.
         world: a world instead of a checkpoint.
-        on_progress: called with the parts done, and what is done.
+        on_progress: called with the parts done, what is done, and the number of parts.
         settings: of the world made from the checkpoint, as of `load_world`.
 
     Raises:
@@ -129,10 +129,10 @@ def benchmark(
             made: dict[str, dict[str, Any]] = {name: {} for name in tables}
             for number, robot in enumerate(robots):
 
-                def tell(words: str, number: int = number, robot: str = robot) -> None:
-                    on_progress(number, f"{robot}, {words}")
+                def on_part(done: int, words: str, begun: int = PARTS * number, robot: str = robot) -> None:
+                    on_progress(begun + done, f"{robot}, {words}", PARTS * len(robots))
 
-                one = _Robot(world, robot, protocol, seed, kept, tell)
+                one = _Robot(world, robot, protocol, seed, kept, on_part)
                 for name, figures in zip(tables, one.measured(), strict=True):
                     made[name][robot] = figures
             found = facts | {"checkpoint": str(checkpoint)} | made
@@ -153,7 +153,11 @@ class _Robot:
     protocol: Protocol
     seed: int
     kept: KeptParts
-    tell: Tell
+    on_part: Callable[[int, str], None]
+    done: int = 0  # parts
+
+    def tell(self, words: str) -> None:
+        self.on_part(self.done, words)
 
     @cached_property
     def scenes(self) -> Scenes:
@@ -166,9 +170,9 @@ class _Robot:
     def measured(self) -> tuple[dict[str, Any], ...]:
         """Return the figures, and those by scene, by frame of the action sequences and by choice."""
         frames = self.protocol.frames
-        self.tell("action sequences")
         arrays = self._part(
-            "choices", lambda: choose(self.world, self.scenes, self.probe, Scripted(NOISE), frames)
+            "choices",
+            lambda: choose(self.world, self.scenes, self.probe, Scripted(NOISE), frames, tell=self.tell),
         )
         found, by_scene, by_choice = choice_figures(arrays, self.seed)
         by_frame = frame_errors(arrays)
@@ -202,7 +206,9 @@ class _Robot:
         return found, by_scene, *raw
 
     def _part(self, name: str, make: Callable[[], Arrays]) -> Arrays:
-        return self.kept.part(f"{name}-{self.robot}", make)
+        made = self.kept.part(f"{name}-{self.robot}", make)
+        self.done += 1
+        return made
 
     def _planned(self) -> dict[str, Bools]:
         """Return which goals are reached in each of WAYS."""

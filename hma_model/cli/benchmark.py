@@ -54,7 +54,7 @@ def benchmark(
     there = device_name(device)
     with (
         interruptible(lambda: kept("parts", out)),
-        progress("benchmark", len(protocol.robots), unit="robots") as update,
+        progress("benchmark", unit="parts") as update,
     ):
         found = run(
             checkpoint, out, protocol, seed=seed, unmask_steps=unmask_steps, temperature=temperature,

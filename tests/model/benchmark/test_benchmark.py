@@ -102,13 +102,18 @@ def test_a_probe_that_reads_nothing_measures_no_decision_and_no_calibration(tmp_
     world = world_of(FrozenWorld)
     stated = running.choose
 
-    def choose(*given: Any) -> Any:
-        found = stated(*given)
+    def choose(*given: Any, **how: Any) -> Any:
+        found = stated(*given, **how)
         return found | {"uncertainty": np.ones_like(found["uncertainty"])}
 
     monkeypatch.setattr(running, "choose", choose)
-    found = benchmark("it", tmp_path, replace(TINY, scenes=8), world=world)
+    told: list[tuple[int, str, int]] = []
+    found = benchmark(
+        "it", tmp_path, replace(TINY, scenes=8), world=world, on_progress=lambda *one: told.append(one)
+    )
     write_report(found, tmp_path)
+    assert [words for _, words, _ in told][:2] == [f"{ROBOT}, action sequence {n} of 5" for n in (1, 2)]
+    assert [(done, total) for done, _, total in told] == sorted((done, 5) for done, *_ in told)
     one = found["measures"][ROBOT]
     assert one["decision"] is one["decision_95"] is one["chance"] is one["error_px"] is None
     assert one["calibration"] == {"missing": "the probe locates no part"}
@@ -124,7 +129,7 @@ def test_the_calibration_is_recomputed_from_what_is_written(tmp_path, monkeypatc
     made[..., 0, 0] = errors
     found = {"uncertainty": uncertainty, "true": 0 * made, "made": made}
     found |= {"psnr": 40 - errors, "copy_psnr": 0 * errors}
-    monkeypatch.setattr(running, "choose", lambda *given: found)
+    monkeypatch.setattr(running, "choose", lambda *given, **how: found)
     none = {way: np.zeros(12, bool) for way in planning.WAYS}
     monkeypatch.setattr(running._Robot, "_planned", lambda self: none)
     monkeypatch.setattr(running._Robot, "_policies", lambda self: json.dumps({"missing": "no judge"}))
