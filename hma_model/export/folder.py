@@ -17,6 +17,7 @@
 P frames of a start, K = stride * action dim.
 """
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -47,6 +48,7 @@ from hma_model.worlds.world import World
 
 FORMAT, FORMAT_VERSION = "hma-export", 1
 MANIFEST, STEP, ROBOTS = "manifest.json", "step.onnx", "robots"
+ROBOT_FILE = re.compile(r"stem\.onnx|(frames|chunks|replays)\.npy|(start-\d+|table)\.png|replay-\d+\.webp")
 PARTS = ("page-step.onnx", "page-image.onnx", "page-image-gpu.onnx")
 COLUMNS = 10  # true images in a row of a picture
 QUALITY = 90  # of WebP
@@ -161,10 +163,16 @@ def _require_own(out: Path) -> None:
         return
     if not (out / MANIFEST).is_file() or read_json(out / MANIFEST).get("format") != FORMAT:
         raise OutputError(out, "holds something else than an export", "choose another --out")
-    ours = {MANIFEST, STEP, *PARTS, ROBOTS} | page_names()
-    if foreign := sorted(item.name for item in out.iterdir() if item.name not in ours):
+    ours = {MANIFEST, STEP, *PARTS} | page_names()
+    found = (item.relative_to(out) for item in out.rglob("*") if item.is_symlink() or not item.is_dir())
+    foreign = sorted(str(name) for name in found if name.parts[0] not in ours and not _is_of_robot(name))
+    if foreign:
         fault = f"holds files that are not of the export: {', '.join(foreign[:3])}"
         raise OutputError(out, fault, "it would be replaced: move them out, or choose another --out")
+
+
+def _is_of_robot(name: Path) -> bool:
+    return len(name.parts) == 3 and name.parts[0] == ROBOTS and bool(ROBOT_FILE.fullmatch(name.name))
 
 
 def _write_robot(folder: Path, model: HMA, robot: Drivable, starts: Sequence[Start]) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from hma_model.checkpoint.io import load
 from hma_model.cli.export import export_checkpoint
 from hma_model.evaluation.metrics import psnr
 from hma_model.export.files import rounded
-from hma_model.export.folder import _meter
+from hma_model.export.folder import _meter, _require_own
 from hma_model.export.graphs import require_exportable
 from hma_model.export.truth import table_values
 from hma_model.generation.decode import decode
@@ -116,6 +116,7 @@ def test_the_manifest_says_how_to_drive_and_its_digests_fit(tokens: Path) -> Non
         assert (len(content), hashlib.sha256(content).hexdigest()) == (part["bytes"], part["sha256"])
     assert np.load(tokens / robot["frames"]).shape[:2] == (3, 4) and len(robot["held"]) == 3
     assert all((tokens / picture).is_file() for picture in robot["pictures"])
+    _require_own(tokens)  # it may be exported again to the same folder
 
 
 def test_a_page_whose_graphs_measure_no_uncertainty_has_no_meter() -> None:

@@ -117,8 +117,9 @@ def test_a_full_disk_is_one_clear_error_and_leaves_the_older_export(page: Path, 
         export(page / "step.onnx" / "page")
 
 
-@pytest.mark.parametrize("name", [".git", "notes.txt", "robots.zip"])
+@pytest.mark.parametrize("name", [".git", "notes.txt", "robots/notes.txt", "robots/arm/notes.txt"])
 def test_an_export_with_files_of_the_user_is_not_replaced(name: str, page: Path, export: Any) -> None:
+    (page / name).parent.mkdir(parents=True, exist_ok=True)
     (page / name).write_text("mine")
     with pytest.raises(OutputError, match=f"not of the export: {name} — .*move them out"):
         export(page)
