@@ -34,7 +34,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/evaluation": (4_528, 35_813, 24),
     "hma_model/export": (1_168, 9_340, 9),
     "hma_model/generation": (1_590, 12_422, 9),
-    "hma_model/hub": (1_042, 7_910, 6),
+    "hma_model/hub": (1_044, 7_935, 6),
     "hma_model/lerobot_env": (606, 4_580, 3),
     "hma_model/network": (3_473, 30_206, 19),
     "hma_model/play": (1_602, 11_787, 8),
@@ -44,7 +44,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_670, 30_161, 20),
     "hma_model/worlds": (1_473, 10_918, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_072, 510_353
+PRODUCT_LINES, PRODUCT_NODES = 65_074, 510_378
 TEST_LINES = 46_581
 DOC_WORDS = 41_996
 

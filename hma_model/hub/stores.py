@@ -220,6 +220,8 @@ def open_published(source: StrPath, revision: str | None) -> tuple[Store, dict[s
         name = as_text(source)
         if not is_repository(source) or "://" in name:
             raise
+        if revision:
+            raise HubError(f"{name}@{revision}", fault.fault, fault.remedy) from fault
         both = f"is not a local folder; as a repository of the hub: {fault.fault}"
         remedy = f"give the path of a checkpoint or run, or: {fault.remedy}"
         raise HubError(name, both, remedy) from fault
