@@ -41,11 +41,11 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/policies": (2_843, 20_324, 14),
     "hma_model/released": (799, 6_783, 4),
     "hma_model/synthetic": (1_205, 9_254, 5),
-    "hma_model/training": (3_670, 30_161, 20),
+    "hma_model/training": (3_671, 30_162, 20),
     "hma_model/worlds": (1_473, 10_918, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_074, 510_378
-TEST_LINES = 46_581
+PRODUCT_LINES, PRODUCT_NODES = 65_075, 510_379
+TEST_LINES = 46_588
 DOC_WORDS = 41_996
 
 

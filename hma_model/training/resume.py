@@ -16,6 +16,7 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -84,8 +85,8 @@ def require_network(before: HMAConfig, now: HMAConfig, where: object) -> None:
 
 def other_actions(known: Embodiment, now: Embodiment) -> str:
     """Return how a robot's actions differ from those that its stem was trained with; empty if not."""
-    for key in ("action_dim", "stride", "normalize_mask"):
-        old, new = getattr(known, key), getattr(now, key)
+    for key in ("action_dim", "stride", "normalize_mask", "action.space"):
+        old, new = map(attrgetter(key), (known, now))
         if not np.array_equal(old, new):
             return f"{now.id} with {key} {old}, the shards have {new}"
     return ""

@@ -30,7 +30,7 @@ class Blocks:
         return np.repeat((cells * 4).astype(np.uint8)[..., None], 3, axis=3)
 
 
-def yaml(name: str, dims: int = 2, stride: int = 2) -> str:
+def yaml(name: str, dims: int = 2, stride: int = 2, space: str = "joint_position") -> str:
     return f"""
 id: {name}
 robot: an arm
@@ -38,7 +38,7 @@ kind: simulation
 frequency_hz: 10
 stride: {stride}
 action:
-  space: joint_position
+  space: {space}
   components: [{{key: actions, dims: {dims}}}]
 cameras: [{{name: top, key: obs/image}}]
 source: {{format: hdf5}}

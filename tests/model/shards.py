@@ -48,11 +48,11 @@ def state_pauses(folder: Path, *pauses: dict[int, int]) -> None:
 
 def make_shards(
     folder: Path, name: str, dims: int = 2, episodes: int = 6, length: int = 24, seed: int = 0,
-    spec: TokenizerSpec = SPEC, held_out: int = 1,
+    spec: TokenizerSpec = SPEC, held_out: int = 1, space: str = "joint_position",
 ) -> Path:  # fmt: skip
     """A finished shard set of one embodiment; its last episodes are for validation."""
     rng = np.random.default_rng(seed)
-    embodiment = Embodiment.from_yaml(yaml(name, dims))
+    embodiment = Embodiment.from_yaml(yaml(name, dims, space=space))
     plan = {
         "embodiment": name,
         "embodiment_hash": embodiment.digest,

@@ -154,6 +154,13 @@ CODED = TokenizerSpec(**{**SPEC.to_json(), "name": "coded", "weights_sha256": "a
     ("name", "shards", "changes", "fault", "said"),
     [
         ("arm", {"dims": 5}, (), CheckpointError, "has arm with action_dim 2, the shards have 5"),
+        (
+            "arm",
+            {"space": "joint_velocity"},
+            (),
+            CheckpointError,
+            r"action\.space joint_position, the shards",
+        ),
         ("leg", {"spec": CODED}, (), CheckpointError, "tokenizer 'raw', the data is of 'coded'"),
         ("leg", {}, ("model.width=32",), RecipeError, r"model\.width.*is 32, .* has 16"),
         ("leg", {}, ("digits=64",), RecipeError, r"gives digits of \(64,\), the checkpoint has \(8, 8\)"),
