@@ -46,7 +46,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
 }
 PRODUCT_LINES, PRODUCT_NODES = 65_075, 510_379
 TEST_LINES = 46_588
-DOC_WORDS = 41_996
+DOC_WORDS = 42_000
 
 
 @cache
