@@ -237,7 +237,7 @@ def keyed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., list
     def make(*dims: int) -> list[str]:
         own = shard_files.yaml
         with monkeypatch.context() as patch:
-            patch.setattr(shard_files, "yaml", lambda *given: own(*given) + "stats_key: arms\n")
+            patch.setattr(shard_files, "yaml", lambda *given, **how: own(*given, **how) + "stats_key: arms\n")
             return [
                 str(make_shards(tmp_path / f"arm{i}", f"arm{i}", width, episodes=4 + 4 * i, seed=i))
                 for i, width in enumerate(dims)
