@@ -45,7 +45,7 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/worlds": (1_473, 10_918, 6),
 }
 PRODUCT_LINES, PRODUCT_NODES = 65_075, 510_379
-TEST_LINES = 46_588
+TEST_LINES = 46_597
 DOC_WORDS = 42_000
 
 

@@ -5,6 +5,7 @@ What a session shares is read only. `folder` is a copy that a test may change.
 
 import shutil
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -22,13 +23,19 @@ from tests.model.shards import make_shards
 from tests.model.true_world import tiny_model
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    """Compute with one thread: on tensors this small, more threads only wait for one another."""
+@contextmanager
+def with_one_thread() -> Iterator[None]:
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    """Compute with one thread: on tensors this small, more threads only wait for one another."""
+    with with_one_thread():
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -68,13 +75,15 @@ def recipe(data: list[str]) -> Callable[..., Recipe]:
 @pytest.fixture(scope="session")
 def tiny_run(data: list[str], tmp_path_factory: pytest.TempPathFactory) -> TrainResult:
     recipe = make_recipe({**TINY, "data": data, "model": {**TINY["model"], "mup": True, "base_width": 8}})
-    return train(recipe, out=tmp_path_factory.mktemp("tiny") / "run", show=False)
+    with with_one_thread():  # a session's fixture begins before the module's; tests compare last bits
+        return train(recipe, out=tmp_path_factory.mktemp("tiny") / "run", show=False)
 
 
 @pytest.fixture(scope="session")
 def finished(data: list[str], tmp_path_factory: pytest.TempPathFactory) -> TrainResult:
     recipe = make_recipe({**TINY, "data": data})
-    return train(recipe, out=tmp_path_factory.mktemp("finished") / "run", show=False)
+    with with_one_thread():  # a session's fixture begins before the module's; tests compare last bits
+        return train(recipe, out=tmp_path_factory.mktemp("finished") / "run", show=False)
 
 
 @pytest.fixture(scope="session")
