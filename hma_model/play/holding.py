@@ -51,8 +51,9 @@ def holdings(checkpoint: Checkpoint) -> dict[str, Holding]:
     known = measured.get(checkpoint.trunk_sha256, {})
     found = {}
     for name in checkpoint.embodiments:
-        follows = value_of(checkpoint.card(name).get("evaluation"), "follows")
+        verdict = str(value_of(checkpoint.card(name).get("evaluation"), "verdict"))
+        says = {"follows": True, "does not follow": False}
+        follows = next((value for words, value in says.items() if verdict.startswith(words)), None)
         own = known.get(name, {})
-        judged = follows if isinstance(follows, bool) else None  # a card may come from anybody
-        found[name] = Holding(own.get("seconds"), own.get("at_least", False), judged)
+        found[name] = Holding(own.get("seconds"), own.get("at_least", False), follows)
     return found

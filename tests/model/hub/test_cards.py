@@ -257,7 +257,7 @@ def test_a_broken_card_of_somebody_else_stops_neither_list_nor_push(folder, tmp_
 
 
 def test_a_broken_card_of_ones_own_stops_neither_push_nor_play(folder, tmp_path, capsys):
-    for data, evaluation in (({"cameras": 3}, {"verdict": 1, "follows": 0}), ([], "follows")):
+    for data, evaluation in (({"cameras": 3}, {"verdict": 1, "follows": False}), ([], "follows")):
         values(data=data, evaluation=evaluation)(folder / "embodiments/arm/card.json")
         assert main(["hub", "push", str(folder), str(tmp_path / "hub")]) == 0
         opened = Checkpoint.open(folder)

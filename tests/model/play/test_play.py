@@ -122,10 +122,19 @@ def test_the_bundled_models_robots_were_measured() -> None:
     assert all(one.follows for one in found.values())
 
 
-@pytest.mark.parametrize("follows", [True, False, None])
-def test_of_other_checkpoints_the_verdict_of_evaluate_counts(follows: bool | None, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("verdict", "follows"),
+    [
+        ("follows its actions: last-frame PSNR gain +4.1 dB", True),
+        ("does not follow its actions yet: last-frame PSNR gain +0.1 dB", False),
+        ("", None),
+    ],
+)
+def test_of_other_checkpoints_the_verdict_of_evaluate_counts(verdict, follows, tmp_path) -> None:
     save(tmp_path / "model", {"arm": 2})
-    record_evaluation(Checkpoint.open(tmp_path / "model"), "arm", {"follows": follows})
+    checkpoint = Checkpoint.open(tmp_path / "model")
+    if verdict:
+        record_evaluation(checkpoint, "arm", {"verdict": verdict})
     assert holdings(Checkpoint.open(tmp_path / "model")) == {"arm": Holding(None, False, follows)}
 
 
