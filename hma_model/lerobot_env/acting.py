@@ -83,6 +83,10 @@ class WorldModelPolicy(PreTrainedPolicy):
             robot, spec = checkpoint.embodiment(name), checkpoint.config.spec
             self._fits = [partial(fitted_view, spec=spec, camera=robot.camera(one)) for one in self._cameras]
             self._stride = robot.stride
+            taken = (config.output_features or {}).get("action")
+            if taken is not None and tuple(taken.shape) != (robot.action_dim,):
+                fault = f"gives {robot.action_dim} values of action, the environment takes {taken.shape[0]}"
+                raise UsageError(self._where, fault, "give a policy of this robot")
             # what the policy takes of the arena that it acts in: lerobot's environments, as they come
             scenes: Any = SimpleNamespace(name=name, seed=0, robot=SimpleNamespace(embodiment=robot))
             self._arena: Any = SimpleNamespace(scenes=scenes)

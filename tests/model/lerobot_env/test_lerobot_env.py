@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.scripts.lerobot_eval import eval_main
@@ -306,6 +307,9 @@ def test_what_does_not_fit_is_one_line(run: Path, tmp_path: Path) -> None:
         policy.select_action(batch(np.zeros((1, 8, 8, 3), np.uint8), "observation.images.hand"))
     with pytest.raises(UsageError, match="not by lerobot"):
         policy.forward({})
+    three = {"action": PolicyFeature(FeatureType.ACTION, (3,))}
+    with pytest.raises(UsageError, match="gives 2 values of action, the environment takes 3"):
+        WorldModelPolicy(WorldModelConfig(checkpoint=str(run), device="cpu", output_features=three))
     acting_saved(tmp_path / "dreams")
     with pytest.raises(HMAError, match="was not trained to act"):
         WorldModelPolicy(WorldModelConfig(checkpoint=str(tmp_path / "dreams"), device="cpu"))
