@@ -49,7 +49,7 @@ from hma_model.training.resume import (
     seed_for,
     write_state,
 )
-from hma_model.training.runtime import ENVIRONMENT, RECIPE, choose_precision, environment
+from hma_model.training.runtime import ENVIRONMENT, RECIPE, attention_form, choose_precision, environment
 from hma_model.training.scheduled_sampling import forwarded
 from hma_model.training.start import Start
 
@@ -144,8 +144,9 @@ class Run:
             return choose_precision(recipe, config, self.device, begun)
 
         precision, reason = self.ranks.once(choose)
-        self.arithmetic = f"precision {precision}: {reason}"
-        return recipe.model_copy(update={"precision": precision})
+        chosen = recipe.model_copy(update={"precision": precision})
+        self.arithmetic = f"precision {precision}: {reason}; {attention_form(chosen, config, self.device)}"
+        return chosen
 
     def _config(self, recipe: Recipe) -> HMAConfig:
         if self.start:

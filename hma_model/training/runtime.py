@@ -24,6 +24,7 @@ from hma_data.errors import HMAError, OutputError, RecipeError
 from hma_model.config import HMAConfig
 from hma_model.generation.packed import has_bfloat16
 from hma_model.network.linear import Linear
+from hma_model.network.trunks.transformer import PRODUCT_KEYS
 from hma_model.training.recipe import Recipe
 
 RECIPE, ENVIRONMENT = "recipe.json", "environment.json"
@@ -111,6 +112,16 @@ def bfloat16_pays() -> bool:
     with torch.inference_mode():
         taken = [(seconds(half=False), seconds(half=True)) for _ in range(8)]
     return GAIN * min(half for _, half in taken) < min(full for full, _ in taken)
+
+
+def attention_form(recipe: Recipe, config: HMAConfig, device: torch.device) -> str:
+    """Return in words how a run computes attention (`hma_model.network.trunks.transformer.attend`)."""
+    if config.trunk == "unet":
+        return "no attention"
+    if device.type == "cpu" and recipe.precision == "bf16" and not recipe.compile:
+        masked = f"torch's float32 kernel for more than {PRODUCT_KEYS} masked keys"
+        return f"attention: matrix products, which are faster in bf16; {masked}"
+    return "attention: torch's fused kernels"
 
 
 def environment(device: torch.device) -> dict[str, Any]:

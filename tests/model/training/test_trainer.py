@@ -28,7 +28,7 @@ from hma_model.training.optim import (
 from hma_model.training.parallel import Ranks
 from hma_model.training.recipe import make_recipe
 from hma_model.training.run import Run
-from hma_model.training.runtime import choose_precision
+from hma_model.training.runtime import attention_form, choose_precision
 from tests.model.robots import CONFIG, make_model
 from tests.model.runs import TINY, train_until, weights
 
@@ -256,16 +256,20 @@ def test_a_resumed_run_keeps_the_precision_that_it_began_with(arm_shards, tmp_pa
     given, out = {**TINY, "data": str(arm_shards)}, tmp_path / "run"
     train_until(make_recipe({**given, "precision": "bf16"}), out, 3)
     train(make_recipe({**given, "precision": "auto"}), out=out)  # of this width, auto alone takes fp32
-    assert "precision bf16: as at the start of the run" in capsys.readouterr().err
+    assert "precision bf16: as at the start of the run; attention: matrix products" in capsys.readouterr().err
     assert json.loads((out / "recipe.json").read_text())["precision"] == "bf16"
     with pytest.raises(RecipeError, match="precision: 'bf16', now 'fp32'"):
         train(make_recipe(given), out=out, show=False)
 
 
-def test_a_run_says_its_precision_first(arm_shards, tmp_path, no_bfloat16, capsys):
+def test_a_run_says_its_precision_and_attention_first(arm_shards, tmp_path, no_bfloat16, capsys):
     train(make_recipe({**TINY, "data": str(arm_shards), "precision": "auto"}), out=tmp_path / "run")
     said = capsys.readouterr().err.splitlines()[0]
-    assert "precision fp32: this processor does not support bf16" in said
+    assert "precision fp32: this processor does not support bf16; attention: torch's" in said
+
+
+def test_a_unet_has_no_attention():
+    assert attention_form(AUTO, HMAConfig(**UNET), CPU) == "no attention"
 
 
 # -- optimizers
