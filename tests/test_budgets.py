@@ -32,11 +32,11 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/cli": (1_742, 11_211, 12),
     "hma_model/demo": (476, 4_000, 4),
     "hma_model/evaluation": (4_528, 35_813, 24),
-    "hma_model/export": (1_168, 9_340, 9),
-    "hma_model/generation": (1_590, 12_422, 9),
+    "hma_model/export": (1_168, 9_350, 9),
+    "hma_model/generation": (1_590, 12_424, 9),
     "hma_model/hub": (1_044, 7_935, 6),
     "hma_model/lerobot_env": (610, 4_647, 3),
-    "hma_model/network": (3_473, 30_206, 19),
+    "hma_model/network": (3_511, 30_661, 19),
     "hma_model/play": (1_603, 11_813, 8),
     "hma_model/policies": (2_843, 20_324, 14),
     "hma_model/released": (799, 6_783, 4),
@@ -44,9 +44,9 @@ BUDGETS = {  # package: lines, syntax nodes, modules; a package's own modules st
     "hma_model/training": (3_683, 30_250, 20),
     "hma_model/worlds": (1_473, 10_918, 6),
 }
-PRODUCT_LINES, PRODUCT_NODES = 65_092, 510_560
-TEST_LINES = 46_614
-DOC_WORDS = 42_000
+PRODUCT_LINES, PRODUCT_NODES = 65_130, 511_027
+TEST_LINES = 46_627
+DOC_WORDS = 41_969
 
 
 @cache

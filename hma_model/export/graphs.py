@@ -234,17 +234,17 @@ class StepGraph(nn.Module):
 
         for features, places, own in self._passes(conditioning, times, past, embed, draws.get("rank")):
             noise = gumbel[:, :, own]
-
+            copied = _at(before, places) if self.config.copy_previous else None
             unsure: list[Tensor] = []
 
             def choose(
-                scores: Tensor, first: int, noise: Tensor = noise, unsure: list[Tensor] = unsure
-            ) -> Tensor:
+                scores: Tensor, first: int, noise: Tensor = noise, unsure: list[Tensor] = unsure,
+                copied: Tensor | None = copied,
+            ) -> Tensor:  # fmt: skip
                 unsure.append(scores)
                 drawn = scores + noise[:, first : first + scores.shape[1], :, : scores.shape[3]]
-                return self.readout.taken(drawn)
+                return self.readout.taken(drawn, copied)
 
-            copied = _at(before, places) if self.config.copy_previous else None
             made = self.readout.decide(_at(features, places), choose, copied)
             digits = _put(digits, places, made.transpose(1, 2))
             likely = torch.cat([_widened(scores, values) for scores in unsure], dim=1).softmax(-1)

@@ -140,7 +140,7 @@ class TokenFrame:
             if noise is not None:
                 n, digits, _, values = scores.shape
                 drawn = scores + noise[:n, first : first + digits, :, :values]
-            taken = readout.taken(drawn)
+            taken = readout.taken(drawn, before)
             if way.measure:
                 unsure.append(torch.special.entr(scores.softmax(-1)).sum((1, -1)))
             if way.order == "confidence":

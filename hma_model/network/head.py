@@ -144,11 +144,15 @@ class TokenReadout(nn.Module):
     def _alone(self, features: Tensor) -> Tensor:
         return self.linear(scaled(features, self.multiplier)).float()
 
-    def taken(self, scores: Tensor) -> Tensor:
-        """Return the values (..., k, F) of a frame's scores (..., k, F, V): the likeliest, or its colours."""
+    def taken(self, scores: Tensor, before: Tensor | None = None) -> Tensor:
+        """Return the values (..., F, k) of a frame's scores (..., F, k, V): the likeliest, or its colours.
+
+        `before` (..., k, F) are those of the frame before, or -1; by default no frame is before.
+        """
         if self.distances is None:
             return scores.argmax(-1)
-        return chosen(scores.softmax(-1).flatten(-3, -2), self.distances).view(scores.shape[:-1])
+        before = None if before is None else before.flatten(-2)
+        return chosen(scores.softmax(-1).flatten(-3, -2), self.distances, before).view(scores.shape[:-1])
 
     def ids(self, digits: Tensor) -> Tensor:
         """Return the ids (...) of digits (..., F)."""

@@ -179,6 +179,19 @@ def test_a_small_object_that_may_lie_here_or_there_keeps_its_pixels_where_they_a
     assert (taken == 4).nonzero().flatten().tolist() == [27, 28, 29]
 
 
+def test_an_object_keeps_of_its_lost_pixels_as_large_a_share_as_the_ground_has_of_the_frame() -> None:
+    readout = unet(**{**COLORS, "tokenizer": {"colors": SHADES}}).token_readout
+    before = torch.zeros(1, 64, 1, dtype=torch.long)
+    before[:, 10:20] = 4
+    shares = torch.full((64, 5), 1e-6)
+    shares[20:40, 4] = torch.linspace(0.1, 0.2, 20)  # 3 of its 10 pixels are expected
+    shares[:, 0] = 1 - shares[:, 4]
+    scores = shares.log().view(1, 1, 64, 5)
+    kept = (readout.taken(scores, before) == 4).flatten().nonzero().flatten().tolist()
+    assert kept == [*range(40 - len(kept), 40)] and 6 <= len(kept) <= 9  # the ground has 54 of 64
+    assert (readout.taken(scores, torch.full_like(before, -1)) == 4).sum() <= 3  # no frame is before
+
+
 @given(st.integers(0, 2**32 - 1), st.floats(0.1, 20.0))
 def test_a_colour_has_the_least_expected_distance_or_restores_one_that_would_be_lost(seed, spread) -> None:
     readout = unet(**{**COLORS, "tokenizer": {"colors": SHADES}}).token_readout
